@@ -3,7 +3,6 @@
 The surface is drawn and follows the tetrahedra, which reach a little beyond it: cut ones are simulated whole.
 
 python examples/newton/drop.py --viewer null --test, or --viewer usd --output-path drop.usd, gl, rerun, viser.
-Without a display and --viewer, frames go to a USD file.
 """
 
 import newton
@@ -103,7 +102,7 @@ class Example:
 
 
 if __name__ == "__main__":
-    viewer, args = wn.open_viewer("drop")
+    viewer, args = newton.examples.init()
     try:
         newton.examples.run(Example(viewer, args), args)
     except KeyboardInterrupt:  # rerun and viser run until then; the output is kept

@@ -1,7 +1,7 @@
 """Two fingers close on a soft block, lift it and hold it.
 
 python examples/newton/gripper.py --viewer null --test --num-frames 180, or --viewer usd --output-path gripper.usd, gl,
-rerun, viser. Without a display and --viewer, frames go to a USD file.
+rerun, viser.
 """
 
 import newton
@@ -103,7 +103,7 @@ class Example:
 
 
 if __name__ == "__main__":
-    viewer, args = wn.open_viewer("gripper")
+    viewer, args = newton.examples.init()
     try:
         newton.examples.run(Example(viewer, args), args)
     except KeyboardInterrupt:  # rerun and viser run until then; the output is kept

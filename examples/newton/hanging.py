@@ -1,7 +1,6 @@
 """Four cantilevers of the same rubber in Newton, each with less damping than the last; the fourth is a forest.
 
 python examples/newton/hanging.py --viewer null --test, or --viewer usd --output-path hanging.usd, gl, rerun, viser.
-Without a display and --viewer, frames go to a USD file.
 """
 
 import newton
@@ -88,7 +87,7 @@ class Example:
 
 
 if __name__ == "__main__":
-    viewer, args = wn.open_viewer("hanging")
+    viewer, args = newton.examples.init()
     try:
         newton.examples.run(Example(viewer, args), args)
     except KeyboardInterrupt:  # rerun and viser run until then; the output is kept

@@ -5,8 +5,6 @@ neighbouring numbers, and neighbouring elements' forces are added up before they
 the fastest.
 """
 
-import functools
-
 import warp as wp
 
 from warp_corot.kernels.math.matrices import column
@@ -54,16 +52,13 @@ def edge_differences(nodes: wp.vec4i, x: wp.array[wp.vec4]):
     return wp.matrix_from_cols(load_node(x, nodes[1]) - x0, load_node(x, nodes[2]) - x0, load_node(x, nodes[3]) - x0)
 
 
-@functools.cache
-def add_stress(rounds: int) -> wp.Function:
+add_forces = add_four_forces(1)
+
+
+@wp.func
+def add_stress(elements: PosedElements, t: int, nodes: wp.vec4i, p: wp.mat33, f: wp.array[wp.vec4]):
     """Add the nodal forces of element t from its first Piola-Kirchhoff stress."""
-    add_forces = add_four_forces(rounds)
-
-    @wp.func
-    def add_stress(elements: PosedElements, t: int, nodes: wp.vec4i, p: wp.mat33, f: wp.array[wp.vec4]):
-        # The rest matrix is read again here, so that it takes no registers in between.
-        h = (-elements.volume[t]) * p * wp.transpose(rest_inverse_of(elements, t))
-        f1, f2, f3 = column(h, 0), column(h, 1), column(h, 2)
-        add_forces(f, nodes, -(f1 + f2 + f3), f1, f2, f3)
-
-    return add_stress
+    # The rest matrix is read again here, so that it takes no registers in between.
+    h = (-elements.volume[t]) * p * wp.transpose(rest_inverse_of(elements, t))
+    f1, f2, f3 = column(h, 0), column(h, 1), column(h, 2)
+    add_forces(f, nodes, -(f1 + f2 + f3), f1, f2, f3)

@@ -27,7 +27,7 @@ from warp_corot.kernels.elements.general_cuda import (
     rest_inverse_of,
 )
 from warp_corot.kernels.elements.simd8 import elastic, headers, scatter_simd8
-from warp_corot.kernels.math.rotation import byers_xu, cofactor, identity3
+from warp_corot.kernels.math.rotation import byers_xu, cofactor, identity3, quick_rotation
 from warp_corot.kernels.modules import unique_kernel
 from warp_corot.kernels.stepping.pace import GROWTH, LEAST, SAFE, STABLE, STRAIN, safe_step
 from warp_corot.kernels.stepping.stability import TURNS, keep_largest
@@ -77,10 +77,9 @@ def active_stress(f: wp.mat33, k: float):
 
 
 @functools.cache
-def scatter_posed(rotation: wp.Function, damped: bool, rounds: int = 1) -> wp.Kernel:
+def scatter_posed(damped: bool) -> wp.Kernel:
     """All forces of tetrahedra, each with the rotation of its own deformation gradient; ``ids`` are their indices in
-    ``activation``, or empty if they are all; ``rounds``: see ``add_four_forces``."""
-    add = add_stress(rounds)
+    ``activation``, or empty if they are all."""
 
     @unique_kernel()
     def scatter_posed(
@@ -104,7 +103,7 @@ def scatter_posed(rotation: wp.Function, damped: bool, rounds: int = 1) -> wp.Ke
         a = activation[place]
         n = load_four(elements.nodes, t)
         gradient = edge_differences(n, x) * rest_inverse_of(elements, t)
-        p = corotated_stress(gradient, rotation(gradient), mu[t], lam[t])
+        p = corotated_stress(gradient, quick_rotation(gradient), mu[t], lam[t])
         if a != 0.0:
             p += active_stress(gradient, k_lambda[t] * a)
         if wp.static(damped):
@@ -113,7 +112,7 @@ def scatter_posed(rotation: wp.Function, damped: bool, rounds: int = 1) -> wp.Ke
                 v0 = v[n[0]]
                 edge_rates = wp.matrix_from_cols(v[n[1]] - v0, v[n[2]] - v0, v[n[3]] - v0)
                 p += viscous_stress(gradient, edge_rates * rest_inverse_of(elements, t), k)
-        add(elements, t, n, p, f)
+        add_stress(elements, t, n, p, f)
 
     return scatter_posed
 

@@ -8,8 +8,14 @@ linearisation of the elastic forces is
 K is R K R^T with each element's rotation where free pieces are turned as they will turn in the step (``turning``). The
 forces f are those there plus K times the way to there. D is the viscosity midway, where a turn has none.
 
-A vector has an entry for each particle, and two for each body, of its translation and its rotation. Entries of what is
-held, or moves as prescribed, are not free.
+A vector has an entry for each particle, and two for each body, of its translation t and of its rotation r = G s, scaled
+so that all three components of s have one moment of inertia. Entries of what is held, or moves as prescribed, are not
+free.
+
+A row is a spring and a damper between a soft surface and a rigid body. It sees the difference e = sum of b_j d_j -
+(t + r x arm) of its two sides. Its force at the end of the step is a function of e, whose derivative S, symmetric and
+positive semi-definite, joins the matrix of the step. A contact that is open then has neither force nor stiffness, so
+forces are found again after each solve.
 """
 
 import functools
@@ -17,10 +23,14 @@ from typing import Any
 
 import warp as wp
 
+from warp_corot.kernels.contact.springs import LOOSE, bound_of
+from warp_corot.kernels.contact.vertices import across
 from warp_corot.kernels.corotated.tangent import keep_gradients
 from warp_corot.kernels.elements.constitutive import hooke, symmetric
-from warp_corot.kernels.elements.elements import GeneralElements, load_node, store_node
+from warp_corot.kernels.elements.elements import GeneralElements, add_force, load_node, store_node
+from warp_corot.kernels.implicit.assembled import root_columns
 from warp_corot.kernels.implicit.increments import COLUMNS, Sums, motion_of
+from warp_corot.kernels.implicit.line_search import TRIED
 from warp_corot.kernels.math.rotation import byers_xu, identity3
 from warp_corot.kernels.stepping.balance import sum_of_lanes
 
@@ -36,6 +46,7 @@ from .particles import (
     place_of,
     trouble_of,
 )
+from .rows import ContactLaw, Row, ease_off, gap_of, is_attachment, point_and_arm, share_of, sum_of
 
 wp.set_module_options({"enable_backward": False})
 
@@ -121,32 +132,31 @@ def begin_particles(
     qd: wp.array[wp.vec3],
     trouble: wp.array[wp.int32],
     entry: wp.array[wp.int32],
-    # Out
-    free: wp.array[wp.float32],
-    inertia: wp.array[wp.mat33],
+    # In and out
     b: wp.array[wp.vec4],
+    # Out
+    mass: wp.array[wp.float32],
     d: wp.array[wp.vec4],
     fall: wp.array[wp.vec4],
 ):
-    """Inertia, right side and first motion of particles, and the guess of how gravity changes that. Nothing moves in
-    worlds that have failed."""
+    """Inertia of particles [kg/s^2], their right side, in addition to K times the way, their first motion, and the
+    guess of how gravity changes that: a solve to a share of large forces would not find that a body falls freely.
+    Nothing moves in worlds that have failed. The right side of what is not free is its motion."""
     i = wp.tid()
     k = entry[i]
-    free[k] = 0.0
-    right = wp.vec3()
+    mass[k] = 0.0
     motion = wp.vec3()
     falls = wp.vec3()
     if trouble_of(i, particles, trouble) == SOUND and is_active(i, particles):
         motion = dt * qd[i]
-        if particles.inv_mass[i] > 0.0:
-            m = 1.0 / particles.inv_mass[i]
-            free[k] = 1.0
-            inertia[k] = (m * (1.0 / dt + damping) / dt) * wp.identity(3, dtype=wp.float32)
-            g = gravity_of(i, particles)
-            right = (m / dt) * qd[i] + load_node(f, i) + m * g
-            # A solve to a share of large forces would not find that a body falls freely.
-            falls = (dt * dt / (1.0 + dt * damping)) * g
-            motion = motion / (1.0 + dt * damping)
+    right = wp.vec3(motion)
+    if is_moved(i, particles) and trouble_of(i, particles, trouble) == SOUND:
+        m = 1.0 / particles.inv_mass[i]
+        g = gravity_of(i, particles)
+        mass[k] = m * (1.0 / dt + damping) / dt
+        right = load_node(b, k) + (m / dt) * qd[i] + load_node(f, i) + m * g
+        motion = motion / (1.0 + dt * damping)
+        falls = (dt * dt / (1.0 + dt * damping)) * g
     store_node(b, k, right)
     store_node(d, k, motion)
     store_node(fall, k, falls)
@@ -163,101 +173,69 @@ def begin_bodies(
     trouble: wp.array[wp.int32],
     entry: wp.array[wp.int32],
     # Out
-    free: wp.array[wp.float32],
-    inertia: wp.array[wp.mat33],
     b: wp.array[wp.vec4],
+    mass: wp.array[wp.float32],
     d: wp.array[wp.vec4],
     fall: wp.array[wp.vec4],
+    roots: wp.array[wp.mat33],
 ):
     """The same of bodies, as if nothing but soft bodies, gravity and ``body_f`` acted on them.
 
     Args:
         moves: Whether bodies move by their own velocities; else they stay.
+        roots: G of each body, with G G^T its inverse inertia times a mean moment of inertia.
     """
     i = wp.tid()
     k = entry[i]
+    linear = wp.vec3()
+    angular = wp.vec3()
+    w = float(0.0)
+    if trouble[place_of(bodies.world[i], trouble.shape[0])] == SOUND and moves != 0:
+        linear = dt * wp.spatial_top(bodies.qd[i])
+        angular = dt * wp.spatial_bottom(bodies.qd[i])
+        if not is_fixed(i, bodies):
+            w = bodies.inv_mass[i]
     for part in range(2):
-        free[k + part] = 0.0
-        store_node(b, k + part, wp.vec3())
-        store_node(d, k + part, wp.vec3())
+        mass[k + part] = 0.0
         store_node(fall, k + part, wp.vec3())
-    if trouble[place_of(bodies.world[i], trouble.shape[0])] != SOUND or moves == 0:
-        return
-    linear = dt * wp.spatial_top(bodies.qd[i])
-    angular = dt * wp.spatial_bottom(bodies.qd[i])
+    root = wp.identity(3, dtype=wp.float32)
+    right = wp.vec3(linear)
+    right_turn = wp.vec3(angular)
+    if w > 0.0:
+        g = gravity[place_of(bodies.world[i], gravity.shape[0])]
+        inertia = 1.0 / (w * dt * dt)
+        mass[k] = inertia
+        right = inertia * linear + wp.spatial_top(body_f[i]) + g / w
+        store_node(fall, k, (dt * dt) * g)
+        if wp.determinant(bodies.inv_inertia[i]) > 0.0:
+            turn = wp.quat_to_matrix(wp.transform_get_rotation(bodies.q[i]))
+            moment = 3.0 / wp.trace(bodies.inv_inertia[i])
+            root = wp.sqrt(moment) * root_columns(turn * bodies.inv_inertia[i] * wp.transpose(turn))
+            mass[k + 1] = moment / (dt * dt)
+            spin = turn * (bodies.inertia[i] * (wp.transpose(turn) * angular))
+            angular = (wp.transpose(root) * spin) / moment
+            right_turn = mass[k + 1] * angular + wp.transpose(root) * wp.spatial_bottom(body_f[i])
+    roots[i] = root
+    store_node(b, k, right)
+    store_node(b, k + 1, right_turn)
     store_node(d, k, linear)
     store_node(d, k + 1, angular)
-    w = bodies.inv_mass[i]
-    if w == 0.0 or is_fixed(i, bodies):
-        return
-    g = gravity[place_of(bodies.world[i], gravity.shape[0])]
-    free[k] = 1.0
-    inertia[k] = (1.0 / (w * dt * dt)) * wp.identity(3, dtype=wp.float32)
-    store_node(b, k, linear / (w * dt * dt) + wp.spatial_top(body_f[i]) + g / w)
-    store_node(fall, k, (dt * dt) * g)
-    if wp.determinant(bodies.inv_inertia[i]) > 0.0:
-        turn = wp.quat_to_matrix(wp.transform_get_rotation(bodies.q[i]))
-        free[k + 1] = 1.0
-        inertia[k + 1] = (turn * bodies.inertia[i] * wp.transpose(turn)) / (dt * dt)
-        store_node(b, k + 1, inertia[k + 1] * angular + wp.spatial_bottom(body_f[i]))
 
 
 @wp.kernel(enable_backward=False)
-def finish_rows(
-    # In
-    free: wp.array[wp.float32],
-    inertia: wp.array[wp.mat33],
-    x: wp.array[wp.vec4],
-    # In and out
-    y: wp.array[wp.vec4],
-):
-    """y += M x at free entries, y = 0 at others."""
-    k = wp.tid()
-    v = wp.vec3()
-    if free[k] > 0.0:
-        v = load_node(y, k) + inertia[k] * load_node(x, k)
-    store_node(y, k, v)
-
-
-@wp.kernel(enable_backward=False)
-def finish_blocks(free: wp.array[wp.float32], inertia: wp.array[wp.mat33], blocks: wp.array[wp.mat33]):
-    k = wp.tid()
-    block = wp.identity(3, dtype=wp.float32)
-    if free[k] > 0.0:
-        block = blocks[k] + inertia[k]
-    blocks[k] = block
-
-
-@wp.kernel(enable_backward=False)
-def clear_held(free: wp.array[wp.float32], a: wp.array[wp.vec4]):
-    """a = 0 at entries that are not free."""
-    k = wp.tid()
-    if free[k] == 0.0:
-        store_node(a, k, wp.vec3())
-
-
-@wp.kernel(enable_backward=False)
-def count_solves(
+def add_first(
     # In
     first: wp.array[wp.int32],
-    iterations: wp.array[wp.int32],
-    rounds: wp.array[wp.int32],
-    status: wp.array[wp.int32],
-    good: int,
+    solves: wp.array[wp.int32],
+    # In and out
+    linear: wp.array[wp.int32],
     # Out
-    totals: wp.array[wp.int64],
+    rounds: wp.array[wp.int32],
 ):
-    """Count steps, solves, iterations of the world that needed most, and steps in which a solve did not end well."""
-    linear = int(0)
-    unfinished = int(0)
-    for world in range(status.shape[0]):
-        linear = wp.max(linear, first[world] + iterations[world])
-        if status[world] != good:
-            unfinished = 1
-    totals[0] = totals[0] + wp.int64(1)
-    totals[1] = totals[1] + wp.int64(rounds[0] + 1)
-    totals[2] = totals[2] + wp.int64(linear)
-    totals[3] = totals[3] + wp.int64(unfinished)
+    """Add the first solve to the iterations of each world and to the number of solves [1]."""
+    world = wp.tid()
+    linear[world] = linear[world] + first[world]
+    rounds[world] = solves[0] + 1
 
 
 # --- how free pieces turn in a step; see ``kernels.implicit.increments`` ----------------------------------------------
@@ -320,3 +298,262 @@ def turn_particles(
         store_node(u, i, load_node(u, i) + d)
     turned[i] = at + d
     store_node(way, entry[i], d)
+
+
+# --- rows ------------------------------------------------------------------------------------------------------------
+
+
+@wp.struct
+class RowSprings:
+    """Rows, as functions of motions; those without a first node are none."""
+
+    nodes: wp.array[wp.vec4i]  # [R] entries of particles, -1 where there is none
+    weights: wp.array[wp.vec4]  # [R]
+    body: wp.array[wp.int32]  # [R] entry of the body's translation, before that of its rotation; -1: there is none
+    arm: wp.array[wp.vec3]  # [R] from the centre of mass, or from the origin [m]
+    lever: wp.array[wp.mat33]  # [R] the matrix of s in r x arm
+    normal: wp.array[wp.vec3]  # [R] zero: an attachment
+    gap: wp.array[wp.vec3]  # [R] at the beginning [m]; of a contact the first component
+    slide: wp.array[wp.vec3]  # [R] velocity of the shape on its body [m/s]
+    law: wp.array[wp.vec4]  # [R] stiffness [N/m], damping [N s/m], slope of friction [N s/m], friction
+    stiffness: wp.array[wp.mat33]  # [R] S [N/m]
+    force: wp.array[wp.vec3]  # [R] on the particles [N]
+    most: wp.array[wp.float32]  # [R] bound of friction [N]
+    solves: wp.array[wp.int32]  # [1] number of linear solves that the step has had so far
+    mass: wp.array[wp.float32]  # of each entry, zero if it is not free
+
+
+@wp.kernel(enable_backward=False)
+def begin_springs(
+    # In
+    dt: float,
+    law: ContactLaw,
+    rows: wp.array[Row],
+    load: wp.array[wp.float32],
+    q: wp.array[wp.vec3],
+    bodies: Bodies,
+    particle_entry: wp.array[wp.int32],
+    body_entry: wp.array[wp.int32],
+    roots: wp.array[wp.mat33],
+    # Out
+    springs: RowSprings,
+):
+    """Springs of rows at the beginning of a step."""
+    c = wp.tid()
+    ease_off(c, dt, law, rows)
+    row = rows[c]
+    if c == 0:
+        springs.solves[0] = 0
+    entries = wp.vec4i(-1, -1, -1, -1)
+    springs.stiffness[c] = wp.mat33()
+    if row.nodes[0] >= 0:
+        for k in range(4):
+            if row.nodes[k] >= 0:
+                entries[k] = particle_entry[row.nodes[k]]
+        point, arm = point_and_arm(row, bodies)
+        entry = int(-1)
+        slide = row.velocity
+        if row.body >= 0:
+            entry = body_entry[row.body]
+            slide = wp.transform_vector(bodies.q[row.body], slide)
+            springs.lever[c] = -wp.skew(arm) * roots[row.body]
+        apart = sum_of(row, q) - point
+        stiffness = float(row.stiffness)
+        if not is_attachment(row):
+            apart = wp.vec3(gap_of(row, apart), 0.0, 0.0)
+            stiffness *= share_of(row, load, law.crowd)
+        springs.weights[c] = row.weights
+        springs.body[c] = entry
+        springs.arm[c] = arm
+        springs.normal[c] = row.normal
+        springs.gap[c] = apart
+        springs.slide[c] = slide
+        springs.most[c] = 0.0
+        law4 = wp.vec4(stiffness, row.damping, row.slope, 0.0) * row.measure
+        law4[3] = row.friction
+        springs.law[c] = law4
+    springs.nodes[c] = entries
+
+
+@wp.func
+def difference(springs: RowSprings, c: int, d: wp.array[wp.vec4]):
+    """e of row c."""
+    nodes = springs.nodes[c]
+    weights = springs.weights[c]
+    e = weights[0] * load_node(d, nodes[0])
+    for k in range(1, 4):
+        if nodes[k] >= 0:
+            e += weights[k] * load_node(d, nodes[k])
+    body = springs.body[c]
+    if body >= 0:
+        e -= load_node(d, body) + springs.lever[c] * load_node(d, body + 1)
+    return e
+
+
+@wp.struct
+class RowState:
+    """A row's force on the particles, its derivative S [N/m], and a contact's push along its normal [N]."""
+
+    force: wp.vec3
+    stiffness: wp.mat33
+    push: float
+
+
+@wp.func
+def row_state(springs: RowSprings, c: int, e: wp.vec3, most: float, dt: float, adhesion: float):
+    """Row c at the difference e of its sides, with friction of at most ``most`` [N].
+
+    Dampers of contacts act on what is deeper than at the beginning, so that the force is monotonic and continuous.
+    """
+    made = RowState()
+    law = springs.law[c]
+    n = springs.normal[c]
+    velocity = e / dt - springs.slide[c]
+    unit = wp.identity(3, dtype=wp.float32)
+    if n == wp.vec3():
+        made.force = -law[0] * (springs.gap[c] + e) - law[1] * velocity
+        made.stiffness = (law[0] + law[1] / dt) * unit
+        return made
+    first = springs.gap[c][0]
+    gap = first + wp.dot(n, e)
+    whole = wp.outer(n, n)
+    if gap <= adhesion:
+        made.push = -law[0] * gap
+        rate = law[0]
+        deeper = wp.max(-gap, 0.0) - wp.max(-first, 0.0)
+        if deeper > 0.0:
+            made.push += law[1] / dt * deeper
+            rate += law[1] / dt
+        made.stiffness = rate * whole
+        made.force = made.push * n
+    if most > 0.0 and law[2] > 0.0:
+        sliding = across(velocity, n)
+        speed = wp.length(sliding)
+        sideways = unit - whole
+        slope = law[2]
+        if slope * speed > most:
+            slope = most / speed
+            sideways -= (LOOSE / (speed * speed)) * wp.outer(sliding, sliding)
+        made.force -= slope * sliding
+        made.stiffness += (slope / dt) * sideways
+    return made
+
+
+@wp.kernel(enable_backward=False)
+def update_springs(
+    # In
+    dt: float,
+    adhesion: float,
+    is_solved: int,
+    d: wp.array[wp.vec4],
+    # In and out
+    springs: RowSprings,
+):
+    """Forces and stiffness after motions d. If these have just been solved for, the bounds of friction follow the
+    pushes there."""
+    c = wp.tid()
+    if springs.nodes[c][0] < 0:
+        return
+    e = difference(springs, c, d)
+    push = wp.max(row_state(springs, c, e, 0.0, dt, adhesion).push, 0.0)
+    most = bound_of(springs.most[c], push, springs.law[c][3], is_solved != 0, springs.solves[0])
+    made = row_state(springs, c, e, most, dt, adhesion)
+    springs.most[c] = most
+    springs.force[c] = made.force
+    springs.stiffness[c] = made.stiffness
+
+
+@wp.kernel(enable_backward=False)
+def add_row_slopes(
+    # In
+    dt: float,
+    adhesion: float,
+    springs: RowSprings,
+    count: int,
+    d: wp.array[wp.vec4],
+    change: wp.array[wp.vec4],
+    search: wp.array2d[wp.float64],
+    # Out
+    slopes: wp.array[wp.float64],
+):
+    """Add the power of rows along ``change`` at the tried share of it, world by world [count entries]."""
+    c = wp.tid()
+    node = springs.nodes[c][0]
+    if node < 0:
+        return
+    world = node / count
+    of_change = difference(springs, c, change)
+    e = difference(springs, c, d) + float(search[world, TRIED]) * of_change
+    made = row_state(springs, c, e, springs.most[c], dt, adhesion)
+    wp.atomic_add(slopes, world, wp.dot(wp.vec3d(made.force), wp.vec3d(of_change)))
+
+
+@wp.kernel(enable_backward=False)
+def add_row_forces(springs: RowSprings, x: wp.array[wp.vec4], y: wp.array[wp.vec4]):
+    """y += S x at free entries; if x is empty, the rows' forces [N, N m]."""
+    c = wp.tid()
+    nodes = springs.nodes[c]
+    if nodes[0] < 0:
+        return
+    force = wp.vec3()
+    if x.shape[0] > 0:
+        s = springs.stiffness[c]
+        if wp.trace(s) == 0.0:
+            return
+        force = s * difference(springs, c, x)
+    else:
+        force = springs.force[c]
+    weights = springs.weights[c]
+    for k in range(4):
+        if nodes[k] >= 0:  # noqa: SIM102 - the next value exists only then
+            if springs.mass[nodes[k]] > 0.0:
+                add_force(y, nodes[k], weights[k] * force)
+    body = springs.body[c]
+    if body >= 0:
+        if springs.mass[body] > 0.0:
+            add_force(y, body, -force)
+        if springs.mass[body + 1] > 0.0:
+            add_force(y, body + 1, -(wp.transpose(springs.lever[c]) * force))
+
+
+@wp.kernel(enable_backward=False)
+def add_row_blocks(springs: RowSprings, blocks: wp.array[wp.mat33]):
+    """Add the 3x3 blocks on the diagonal."""
+    c = wp.tid()
+    s = springs.stiffness[c]
+    nodes = springs.nodes[c]
+    if nodes[0] < 0 or wp.trace(s) == 0.0:
+        return
+    weights = springs.weights[c]
+    for k in range(4):
+        if nodes[k] >= 0:
+            wp.atomic_add(blocks, nodes[k], weights[k] * weights[k] * s)
+    body = springs.body[c]
+    if body >= 0:
+        lever = springs.lever[c]
+        wp.atomic_add(blocks, body, s)
+        wp.atomic_add(blocks, body + 1, wp.transpose(lever) * s * lever)
+
+
+@wp.kernel(enable_backward=False)
+def report_rows(
+    # In
+    springs: RowSprings,
+    contacts: int,
+    entry_body: wp.array[wp.int32],
+    share: float,
+    first: int,
+    # Out
+    body_f: wp.array[wp.spatial_vector],
+    reported: wp.array[wp.spatial_vector],
+):
+    """Wrenches on bodies, about their centres of mass, and of each contact; see ``explicit.scatter_rows``."""
+    c = wp.tid()
+    if springs.nodes[c][0] < 0:
+        return
+    force = springs.force[c]
+    wrench = -wp.spatial_vector(force, wp.cross(springs.arm[c], force))
+    if springs.body[c] >= 0:
+        wp.atomic_add(body_f, entry_body[springs.body[c]], wrench)
+    if c < contacts and reported.shape[0] > 0:
+        reported[first + c] += share * wrench

@@ -7,11 +7,10 @@ arrays over worlds.
 """
 
 import functools
-from typing import NamedTuple
 
 import warp as wp
 
-from warp_corot.kernels.elements.elements import load_node, store_node
+from warp_corot.kernels.elements.elements import add_force, load_node, store_node
 from warp_corot.kernels.stepping.integrate import is_finite
 
 wp.set_module_options({"enable_backward": False})
@@ -52,7 +51,7 @@ class Bodies:
     inertia: wp.array[wp.mat33]
     com: wp.array[wp.vec3]
     places: wp.array[wp.int32]  # at how many places each is touched or held
-    yielding: wp.array[wp.spatial_vector]  # see ``explicit_rows``
+    yielding: wp.array[wp.spatial_vector]  # see ``explicit``
     q: wp.array[wp.transform]
     qd: wp.array[wp.spatial_vector]
 
@@ -190,36 +189,6 @@ def add_nodes(
     store_node(nodal, k, wp.vec3())
 
 
-@wp.func
-def take_motion(
-    i: int,
-    at: wp.vec3,
-    v: wp.vec3,
-    dt: float,
-    most: float,
-    fastest: float,
-    particles: Particles,
-    q_out: wp.array[wp.vec3],
-    qd_out: wp.array[wp.vec3],
-    trouble: wp.array[wp.int32],
-):
-    """Write an active particle's state after a step with a velocity, no faster than ``most`` [m/s].
-
-    One faster than ``fastest`` marks its world, like a value that is not finite.
-    """
-    # Scaled, so that nothing overflows.
-    size = wp.max(wp.max(wp.abs(v)), 1.0)
-    speed = size * wp.length(v / size)
-    velocity = v
-    if speed > most:
-        velocity = v * (most / speed)
-    to = at + dt * velocity
-    if speed >= fastest or not is_finite(to):
-        mark(i, UNSTABLE, particles, trouble)
-    store_vector(q_out, i, to)
-    store_vector(qd_out, i, velocity)
-
-
 @wp.kernel(enable_backward=False)
 def step_particles(
     # In
@@ -238,10 +207,11 @@ def step_particles(
     qd_out: wp.array[wp.vec3],
     trouble: wp.array[wp.int32],
 ):
-    """v <- (v + dt (f/m + g)) / (1 + dt damping), or d/dt of solved motions d; x <- x + dt v; see ``take_motion``.
+    """v <- (v + dt (f/m + g)) / (1 + dt damping), or d/dt of solved motions d; x <- x + dt v.
 
     A particle without mass is kinematic: it keeps its velocity. An inactive one is frozen. In worlds marked before
-    nothing moves.
+    nothing moves. No active particle is faster than ``most`` [m/s]; one faster than ``fastest`` marks its world, like a
+    value that is not finite.
 
     Args:
         entry, d: Where the motion of each particle is, and motions [m], see ``implicit``; empty in explicit steps.
@@ -250,6 +220,7 @@ def step_particles(
     wrong = trouble_of(i, particles, trouble)
     if wrong == BAD_INPUT:
         return
+    at = q[i]
     velocity = qd[i]
     if wrong == SOUND and is_active(i, particles):
         w = particles.inv_mass[i]
@@ -257,35 +228,51 @@ def step_particles(
             velocity = load_node(d, entry[i]) / dt
         elif w > 0.0:
             velocity = (velocity + dt * (w * load_node(f, i) + gravity_of(i, particles))) / (1.0 + dt * damping)
-        take_motion(i, q[i], velocity, dt, most, fastest, particles, q_out, qd_out, trouble)
-    else:
-        store_vector(q_out, i, q[i])
-        store_vector(qd_out, i, velocity)
+        # Scaled, so that nothing overflows.
+        size = wp.max(wp.max(wp.abs(velocity)), 1.0)
+        speed = size * wp.length(velocity / size)
+        if speed > most:
+            velocity = velocity * (most / speed)
+        at += dt * velocity
+        if speed >= fastest or not is_finite(at):
+            mark(i, UNSTABLE, particles, trouble)
+    store_vector(q_out, i, at)
+    store_vector(qd_out, i, velocity)
 
 
 @wp.kernel(enable_backward=False)
-def damp_particles(
+def add_changes(
     # In
     dt: float,
-    damping: float,
     particles: Particles,
+    before: wp.array[wp.vec3],
+    after: wp.array[wp.vec3],
     # In and out
-    q: wp.array[wp.vec3],
-    qd: wp.array[wp.vec3],
+    f: wp.array[wp.vec4],
 ):
-    """Apply the damping of ``step_particles`` after a step without it."""
+    """Add the forces besides gravity that changed velocities in a step."""
     i = wp.tid()
     if is_moved(i, particles):
-        velocity = qd[i]
-        slower = velocity / (1.0 + dt * damping)
-        q[i] += dt * (slower - velocity)
-        qd[i] = slower
+        change = (after[i] - before[i]) / dt - gravity_of(i, particles)
+        store_node(f, i, load_node(f, i) + change / particles.inv_mass[i])
 
 
 @wp.kernel(enable_backward=False)
-def unpad(a: wp.array[wp.vec4], b: wp.array[wp.vec3]):
-    i = wp.tid()
-    b[i] = load_node(a, i)
+def scatter_blocks(
+    # In
+    pairs: wp.array[wp.vec2i],
+    stiffness: wp.array[wp.mat33],
+    damping: wp.array[wp.mat33],
+    a: float,
+    b: float,
+    u: wp.array[wp.vec4],
+    # Out
+    f: wp.array[wp.vec4],
+):
+    """f -= (a K + b C) u of matrices that are given by blocks of pairs of particles, which may repeat."""
+    k = wp.tid()
+    pair = pairs[k]
+    add_force(f, pair[0], -(a * stiffness[k] + b * damping[k]) * load_node(u, pair[1]))
 
 
 # --- rigid bodies within a step, between the states that another solver gives ----------------------------------------
@@ -326,29 +313,28 @@ def add_wrenches(
 # --- worlds ----------------------------------------------------------------------------------------------------------
 
 
-@wp.func
-def is_sound(q: wp.vec3, qd: wp.vec3, fastest: float):
-    return is_finite(q) and wp.max(wp.abs(qd)) < 0.5 * fastest
-
-
-@wp.func
-def is_sound(q: wp.transform, qd: wp.spatial_vector, fastest: float):
-    size = wp.dot(wp.abs(q[0:3]), wp.vec3(1.0)) + wp.dot(wp.abs(wp.spatial_top(qd)), wp.vec3(1.0))
-    size += wp.dot(wp.abs(wp.spatial_bottom(qd)), wp.vec3(1.0))
-    return size <= 3.0e38
-
-
-class StateKernels(NamedTuple):
-    """Kernels over states of particles or bodies."""
-
-    check: wp.Kernel
-    put_back: wp.Kernel
-    reset: wp.Kernel
+@wp.kernel(enable_backward=False)
+def check_bodies(
+    # In
+    q: wp.array[wp.transform],
+    qd: wp.array[wp.spatial_vector],
+    world: wp.array[wp.int32],
+    wrong: int,
+    # Out
+    trouble: wp.array[wp.int32],
+):
+    """Mark worlds with a body whose pose or velocity is not finite."""
+    i = wp.tid()
+    size = wp.dot(wp.abs(q[i][0:3]), wp.vec3(1.0)) + wp.dot(wp.abs(wp.spatial_top(qd[i])), wp.vec3(1.0))
+    size += wp.dot(wp.abs(wp.spatial_bottom(qd[i])), wp.vec3(1.0))
+    if not size <= 3.0e38:
+        wp.atomic_max(trouble, place_of(world[i], trouble.shape[0]), wrong)
 
 
 @functools.cache
-def state_kernels(Place: type, Velocity: type) -> StateKernels:
-    """The kernels for states with these types: of particles vec3 both, of bodies transforms and spatial vectors.
+def state_kernels(Place: type, Velocity: type) -> tuple[wp.Kernel, wp.Kernel]:
+    """The kernels that finish a step and that reset a state, for states with these types: of particles vec3 both, of
+    bodies transforms and spatial vectors.
 
     They are one module, so that those of resets are loaded with those of steps and may be recorded.
     """
@@ -356,48 +342,30 @@ def state_kernels(Place: type, Velocity: type) -> StateKernels:
     module.options["enable_backward"] = False
 
     @wp.kernel(module=module, enable_backward=False)
-    def check(
-        # In
-        q: wp.array[Place],
-        qd: wp.array[Velocity],
-        fastest: float,
-        world: wp.array[wp.int32],
-        wrong: int,
-        # Out
-        trouble: wp.array[wp.int32],
-    ):
-        """Mark worlds with a value that is not finite, or a particle that is too fast."""
-        i = wp.tid()
-        if not is_sound(q[i], qd[i], fastest):
-            wp.atomic_max(trouble, place_of(world[i], trouble.shape[0]), wrong)
-
-    @wp.kernel(module=module, enable_backward=False)
-    def put_back(
+    def finish(
         # In
         world: wp.array[wp.int32],
         trouble: wp.array[wp.int32],
         before_q: wp.array[Place],
         before_qd: wp.array[Velocity],
-        kept_q: wp.array[Place],
-        kept_qd: wp.array[Velocity],
+        made_q: wp.array[Place],
+        made_qd: wp.array[Velocity],
         # Out
         q: wp.array[Place],
         qd: wp.array[Velocity],
     ):
-        """Undo what was written in marked worlds.
+        """Write what a step has made, and the state before it in marked worlds; where that was not finite, nothing.
 
         Args:
             before_q, before_qd: The state before the step.
-            kept_q, kept_qd: Former values of the output state, for worlds whose input was not finite; or empty,
-                if those were not written.
+            made_q, made_qd: The result; empty if it is in q and qd already.
         """
         i = wp.tid()
         wrong = trouble[place_of(world[i], trouble.shape[0])]
-        if wrong == BAD_INPUT:
-            if kept_q.shape[0] > 0:
-                q[i] = kept_q[i]
-                qd[i] = kept_qd[i]
-        elif wrong != SOUND:
+        if wrong == SOUND and made_q.shape[0] > 0:
+            q[i] = made_q[i]
+            qd[i] = made_qd[i]
+        elif wrong != SOUND and wrong != BAD_INPUT:
             q[i] = before_q[i]
             qd[i] = before_qd[i]
 
@@ -421,7 +389,7 @@ def state_kernels(Place: type, Velocity: type) -> StateKernels:
             if with_qd != 0:
                 qd[i] = initial_qd[i]
 
-    return StateKernels(check, put_back, reset)
+    return finish, reset
 
 
 @wp.kernel(enable_backward=False)

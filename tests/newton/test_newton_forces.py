@@ -18,7 +18,6 @@ from newton_scenes import (
     wn,
 )
 
-from warp_corot.kernels.math.rotation import quick_rotation
 from warp_corot.kernels.newton.elements import scatter_posed
 
 
@@ -75,7 +74,7 @@ def test_all_forces_at_once_as_one_after_another(device, rng, damped):
     padded = wp.array(np.pad(x, ((0, 0), (0, 1))), dtype=wp.vec4, device=device)
     ids = wp.array(np.arange(model.tet_count), dtype=wp.int32, device=device)
     inputs = [tets.posed(np.arange(model.tet_count)), *columns(model), ids, control.tet_activations, padded, qd]
-    wp.launch(scatter_posed(quick_rotation, damped), model.tet_count, inputs, [found], device=device)
+    wp.launch(scatter_posed(damped), model.tet_count, inputs, [found], device=device)
     assert_near(found.numpy()[:, :3], wanted, 1e-4)
 
 
@@ -146,7 +145,7 @@ def test_materials_of_each_tetrahedron(device, rng):
     young = 1e4 * (1 + rng.random(len(forest.tets)))
     made = builder()
     wn.add_forest(made, forest, wc.Isotropic(young=young, poisson=0.3, density=1000.0))
-    mesh = wc.TetMesh(np.add(forest.points, [2.0, 0.0, 0.0]), wn.scene.right_handed(forest))
+    mesh = wc.TetMesh(np.add(forest.points, [2.0, 0.0, 0.0]), wn.scene.outward_tets(forest))
     wn.add_mesh(made, mesh, wc.Isotropic(young=young, poisson=0.3, density=1000.0))
     model = made.finalize(device=device)
     rest = model.particle_q.numpy().astype(float)

@@ -152,16 +152,18 @@ def test_friction_holds_only_below_its_angle(device):
 
 
 def test_a_light_ball_rests_on_a_block(device):
+    """Between four nodes, where it stays: a ball on a node rolls down from it, sooner or later by rounding."""
     made = builder()
     made.add_ground_plane()
     block(made, z=0.006)
-    ball = made.add_body(xform=wp.transform((0.1, 0.1, 0.17), wp.quat_identity()))
+    ball = made.add_body(xform=wp.transform((0.125, 0.125, 0.17), wp.quat_identity()))
     made.add_shape_sphere(ball, radius=0.06, cfg=newton.ModelBuilder.ShapeConfig(density=50.0))
     model = made.finalize(device=device)
     solver, state, _ = stepped(model, 45)
     weight = 9.81 * model.body_mass.numpy()[0]
     assert solver.body_reactions.numpy()[0, 2] == pytest.approx(weight, rel=0.05)
-    assert np.abs(state.body_qd.numpy()[0, :3]).max() < 0.05  # it may roll
+    assert np.abs(state.body_qd.numpy()[0, :3]).max() < 0.01
+    np.testing.assert_allclose(state.body_q.numpy()[0, :2], 0.125, atol=1e-3)
     assert 0.14 < state.body_q.numpy()[0, 2] < 0.17
 
 
@@ -214,7 +216,7 @@ def test_unsupported_models_are_refused(device):
     made = builder()
     block(made)
     model = made.finalize(device=device)
-    with pytest.raises(wc.InputError, match="integrator is 'midpoint'; it must be one of explicit, implicit"):
+    with pytest.raises(wc.InputError, match="integrator is 'midpoint'; it must be 'explicit' or 'implicit'"):
         wn.SolverCorotated(model, integrator="midpoint")
     with pytest.raises(wc.InputError, match="the number of a Newton model's particles is fixed"):
         wn.SolverCorotated(model, cuts=[wc.Blade([(0, 0, 0), (0, 0, 1)])])

@@ -129,27 +129,29 @@ def test_the_ground_carries_a_block(device):
     np.testing.assert_allclose(heights[1], heights[0], atol=1e-5)
 
 
-def test_a_sensor_reads_what_a_body_feels(device):
-    """Per body and per shape, as Newton's sensor of rigid contacts; on a slope, with friction."""
+def test_wrenches_of_a_shape_are_what_its_body_feels(device):
+    """On a slope, with friction."""
     made = builder(gravity=(2.0, 0.0, -9.6))
     body = made.add_body(label="plate", is_kinematic=True)
     made.add_shape_box(body, hx=0.5, hy=0.5, hz=0.1, label="top")
+    made.add_shape_box(body, hx=0.5, hy=0.5, hz=0.1, xform=wp.transform((0.0, 0.0, -0.3), wp.quat_identity()))
     add_grid(made, dims=(2, 2, 2), pos=(0.0, 0.0, 0.1099), damp=200.0)
     model = made.finalize(device=device)
     contact_parameters(model, mu=0.8, kf=1e5)
     state, contacts, observables = drop(model, 1000, damping=20.0, **FULL)
     mass = float(model.particle_mass.numpy().sum())
-    for chosen in ({"sensing_bodies": "pla*"}, {"sensing_shapes": ["top"]}, {"sensing_bodies": [0]}):
-        sensor = wn.SensorSoftContact(model, **chosen)
-        sensor.update(state, contacts, observables=observables)
-        np.testing.assert_allclose(sensor.total_force.numpy()[0], [2.0 * mass, 0.0, -9.6 * mass], atol=0.1 * mass)
-        np.testing.assert_allclose(sensor.total_force_friction.numpy()[0], [2.0 * mass, 0.0, 0.0], atol=0.1 * mass)
-    with pytest.raises(wc.InputError, match="either"):
-        wn.SensorSoftContact(model)
-    with pytest.raises(wc.InputError, match="nothing in the model is 'wall'; there are 1: plate"):
-        wn.SensorSoftContact(model, sensing_bodies="wall")
+    solver = wn.SolverCorotated(model)
+    found = solver.shape_wrenches(contacts, observables).numpy()
+    wanted = observables.contact_f.numpy()[contacts.rigid_contact_max :].astype(float).sum(axis=0)
+    np.testing.assert_allclose(found[0], wanted, atol=1e-3 * mass)
+    np.testing.assert_allclose(found[0, :3], [2.0 * mass, 0.0, -9.6 * mass], atol=0.1 * mass)
+    # The block's weight and the slope's pull, about the plate's centre of mass.
+    x = state.particle_q.numpy() - state.body_q.numpy()[0, :3] - model.body_com.numpy()[0]
+    centre = model.particle_mass.numpy() @ x / mass
+    np.testing.assert_allclose(found[0, 3:], np.cross(centre, found[0, :3]), atol=0.1 * mass)
+    assert not found[1].any()
     with pytest.raises(wc.InputError, match="no contact_f"):
-        sensor.update(state, contacts, observables=None)
+        solver.shape_wrenches(contacts, None)
 
 
 def test_their_stiffness_counts_in_the_stable_step(device):

@@ -3,7 +3,6 @@
 Viewers whose packages are missing are skipped; the test extra installs none but USD.
 """
 
-import importlib.util
 import itertools
 import runpy
 from pathlib import Path
@@ -18,7 +17,6 @@ newton = pytest.importorskip("newton")
 examples = pytest.importorskip("newton.examples")
 
 import warp_corot as wc  # noqa: E402
-import warp_corot.newton as wn  # noqa: E402
 
 FOLDER = Path(__file__).parents[2] / "examples" / "newton"
 FRAMES = 3
@@ -183,50 +181,6 @@ def test_viser_starts_and_stops(example):
     finally:
         viewer.close()
     assert not viewer.is_running()
-
-
-class TestOpenViewer:
-    """Examples choose a viewer that this machine has, and name missing packages in one line."""
-
-    @pytest.fixture(autouse=True)
-    def no_display(self, monkeypatch, tmp_path):
-        monkeypatch.chdir(tmp_path)
-        monkeypatch.setattr("warp_corot.newton.viewing.has_display", lambda: False)
-        monkeypatch.delenv("PYGLET_HEADLESS", raising=False)
-
-    def opened(self, monkeypatch, *options):
-        monkeypatch.setattr("sys.argv", ["drop.py", "--quiet", "--device", "cpu", *options])
-        with wp.ScopedDevice(None):
-            return wn.open_viewer("drop")
-
-    def test_without_a_display_frames_go_to_a_file(self, monkeypatch, capsys, tmp_path):
-        viewer, args = self.opened(monkeypatch)
-        assert isinstance(viewer, newton.viewer.ViewerUSD)
-        assert (args.viewer, args.output_path) == ("usd", "drop.usd")
-        said = capsys.readouterr().err
-        assert said == "there is no display: frames go to drop.usd (--viewer names another viewer)\n"
-
-    def test_a_viewer_that_is_named_is_taken(self, monkeypatch, capsys):
-        viewer, _ = self.opened(monkeypatch, "--viewer", "null", "--num-frames", "3")
-        assert isinstance(viewer, newton.viewer.ViewerNull)
-        assert capsys.readouterr().err == ""
-
-    @pytest.mark.parametrize(("name", "package"), [("gl", "pyglet"), ("rerun", "rerun"), ("viser", "viser")])
-    def test_a_missing_package_is_one_line(self, monkeypatch, name, package):
-        there = importlib.util.find_spec
-        monkeypatch.setattr("warp_corot.newton.viewing.find_spec", lambda n: None if n == package else there(n))
-        with pytest.raises(SystemExit) as ended:
-            self.opened(monkeypatch, "--viewer", name)
-        assert ended.value.code == f'--viewer {name} needs {package}: pip install "warp-corot[viewers]"'
-
-    def test_one_that_cannot_start_is_one_line(self, monkeypatch):
-        def init(parser):
-            raise RuntimeError("no\nGPU here")
-
-        monkeypatch.setattr("newton.examples.init", init)
-        with pytest.raises(SystemExit) as ended:
-            self.opened(monkeypatch, "--viewer", "null")
-        assert ended.value.code == "--viewer null cannot start: no GPU here"
 
 
 def test_a_tape_through_the_solvers_step_is_refused(example):

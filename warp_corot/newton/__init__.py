@@ -16,31 +16,25 @@ if TYPE_CHECKING:
     from warp_corot.newton.stages.steps import StageSimulation
 
     from .scene import Added, add_forest, add_mesh, register_custom_attributes
-    from .sensor import SensorSoftContact
     from .solver import SolverCorotated
-    from .viewing import open_viewer
 
 __all__ = [
     "Added",
-    "SensorSoftContact",
     "SolverCorotated",
     "StageOptions",
     "StageSimulation",
     "add_forest",
     "add_mesh",
-    "open_viewer",
     "register_custom_attributes",
 ]
 
 _MODULES = {
     "Added": ".scene",
-    "SensorSoftContact": ".sensor",
     "SolverCorotated": ".solver",
     "StageOptions": ".stages.stage",
     "StageSimulation": ".stages.steps",
     "add_forest": ".scene",
     "add_mesh": ".scene",
-    "open_viewer": ".viewing",
     "register_custom_attributes": ".scene",
 }
 

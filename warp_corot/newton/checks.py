@@ -1,19 +1,16 @@
-"""Checks of what users give to ``SolverCorotated``: arguments; models whose builder left tetrahedra out; and recordings
-that do not go on from one another."""
+"""Checks of what users give to ``SolverCorotated``: arguments, and recordings that do not go on from one another."""
 
 from __future__ import annotations
 
 import math
 import warnings
-from numbers import Real
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 import warp as wp
 
 from warp_corot.errors import InputError, depth_of_user
-from warp_corot.mesh.topology import boundary_faces
+from warp_corot.inputs.checks import checked_choice, checked_count, checked_number, shown
 
 from .library import ModelView, newton
 from .scene import STATE, attribute_of
@@ -21,7 +18,6 @@ from .scene import STATE, attribute_of
 INTEGRATORS = ("explicit", "implicit")
 #: Meanings of k_mu and k_lambda: mu = a k_mu, lambda = k_lambda + b k_mu, as (a, b).
 LAME = {"documented": (1.0, 0.0), "semi-implicit": (0.75, -0.625)}
-_REPAIR = "build with warp_corot.newton.add_mesh(builder, warp_corot.TetMesh(points, tets), ...), which repairs them"
 
 
 class Step(NamedTuple):
@@ -52,26 +48,26 @@ def check_options(
     Raises:
         InputError: One is out of its range.
     """
-    if not isinstance(model, newton.Model) and not isinstance(model, ModelView):
+    if not isinstance(model, newton.Model | ModelView):
         raise InputError(f"model is {_named(model)}; it must be a newton.Model, the result of builder.finalize()")
     if cuts is not None:
         raise InputError(
             "cuts is given, but a cut makes new particles, and the number of a Newton model's particles is fixed; "
             "warp_corot.Simulation(..., cuts=[blade]) cuts"
         )
-    choices = (("lame", lame, LAME), ("integrator", integrator, INTEGRATORS))
-    for name, value, among in choices:
-        if not isinstance(value, str) or value not in among:
-            raise InputError(f"{name} is {value!r}; it must be one of {', '.join(among)}")
-    if not (is_finite(damping) and damping >= 0):
+    checked_choice(lame, "lame", LAME)
+    checked_choice(integrator, "integrator", INTEGRATORS)
+    if not 0.0 <= checked_number(damping, "damping", "1/s") < math.inf:
         raise InputError(f"damping is {damping!r}; it must be zero or a positive rate in 1/s")
-    if substeps is not None and not (is_finite(substeps) and substeps == int(substeps) and substeps >= 1):
-        raise InputError(f"substeps is {substeps!r}; it must be a positive whole number or None")
-    if stable_dt is not None and not (isinstance(stable_dt, Real) and float(stable_dt) > 0):
+    if substeps is not None:
+        checked_count(substeps, "substeps", 1)
+    if stable_dt is not None and not checked_number(stable_dt, "stable_dt", "s") > 0.0:
         raise InputError(f"stable_dt is {stable_dt!r}; it must be a positive number of seconds or None")
-    if self_contact_margin is not None and not (is_finite(self_contact_margin) and self_contact_margin > 0):
+    if self_contact_margin is None:
+        return
+    if not 0.0 < checked_number(self_contact_margin, "self_contact_margin", "m") < math.inf:
         raise InputError(f"self_contact_margin is {self_contact_margin!r}; it must be a positive distance in m or None")
-    if self_contact_margin is not None and integrator == "implicit":
+    if integrator == "implicit":
         raise InputError(
             "self_contact_margin is given, and integrator is 'implicit', in whose steps soft bodies do not touch one "
             "another: use integrator='explicit', or no self_contact_margin"
@@ -88,17 +84,24 @@ def check_step(step: Step, model: newton.Model) -> None:
     Raises:
         InputError: An argument belongs to another model, or is on another device.
     """
+    found = []
     for name, state in (("state_in", step.state_in), ("state_out", step.state_out)):
-        _check_state(name, state, model)
-    device, control, contacts = model.device, step.control, step.contacts
-    if control is not None and control.tet_activations is not None:
-        activations = control.tet_activations
-        if len(activations) != model.tet_count:
-            raise InputError(f"control has {len(activations)} tet_activations; there are {model.tet_count}")
-        if activations.device != device:
-            raise InputError(f"control is on {activations.device}; the model is on {device}")
-    if contacts is not None and contacts.soft_contact_max and contacts.soft_contact_count.device != device:
-        raise InputError(f"contacts are on {contacts.soft_contact_count.device}; the model is on {device}")
+        if getattr(state, "particle_q", model) is model:
+            raise InputError(f"{name} is {_named(state)}; it must be a newton.State, the result of model.state()")
+        found.append((name, state.particle_q, "particles", model.particle_count))
+        found += [(name, attribute_of(state, each), f"warp_corot.{each}", model.tet_count) for each in STATE]
+    control, contacts = step.control, step.contacts
+    if control is not None:
+        found.append(("control", control.tet_activations, "tet_activations", model.tet_count))
+    for name, array, what, count in found:
+        if array is None and what != "particles":
+            continue
+        if array is None or len(array) != count:
+            raise InputError(f"{name} has {0 if array is None else len(array)} {what}; the model has {count}")
+        if getattr(array, "device", model.device) != model.device:
+            raise InputError(f"{name} is on {array.device}; the model is on {model.device}")
+    if contacts is not None and contacts.soft_contact_max and contacts.soft_contact_count.device != model.device:
+        raise InputError(f"contacts are on {contacts.soft_contact_count.device}; the model is on {model.device}")
 
 
 def checked_dt(dt: Any) -> float:
@@ -107,9 +110,9 @@ def checked_dt(dt: Any) -> float:
     Raises:
         InputError: It is not positive, or not finite.
     """
-    if not (is_finite(dt) and dt > 0):
+    if isinstance(dt, bool) or not 0.0 < checked_number(dt, "dt", "s") < math.inf:
         raise InputError(f"dt is {dt!r}; it must be a positive number of seconds")
-    return dt
+    return float(dt)
 
 
 def checked_mask(world_mask: Any, model: newton.Model) -> wp.array:
@@ -118,33 +121,13 @@ def checked_mask(world_mask: Any, model: newton.Model) -> wp.array:
     Raises:
         InputError: It is not such an array, or is on another device.
     """
-    wanted = f"it must be bool [{model.world_count + 1}] on {model.device}"
-    if not isinstance(world_mask, wp.array):
-        raise InputError(f"world_mask is {world_mask!r}; {wanted}")
-    right = world_mask.dtype == wp.bool and world_mask.shape == (model.world_count + 1,)
-    if not right or world_mask.device != model.device:
-        found = f"{world_mask.dtype.__name__} {list(world_mask.shape)} on {world_mask.device}"
-        raise InputError(f"world_mask is {found}; {wanted}")
+    shape = (model.world_count + 1,)
+    fits = isinstance(world_mask, wp.array) and world_mask.dtype == wp.bool and world_mask.shape == shape
+    if not fits or world_mask.device != model.device:
+        raise InputError(
+            f"world_mask is {shown(world_mask)}; it must be bool [{shape[0]}], a Warp array on {model.device}"
+        )
     return world_mask
-
-
-def is_finite(value: Any) -> bool:
-    """Whether a value is a finite number."""
-    return isinstance(value, Real) and not isinstance(value, bool) and math.isfinite(value)
-
-
-def _check_state(name: str, state: Any, model: newton.Model) -> None:
-    if getattr(state, "particle_q", model) is model:
-        raise InputError(f"{name} is {_named(state)}; it must be a newton.State, the result of model.state()")
-    if state.particle_q is None or len(state.particle_q) != model.particle_count:
-        there = 0 if state.particle_q is None else len(state.particle_q)
-        raise InputError(f"{name} has {there} particles; the model has {model.particle_count}")
-    if state.particle_q.device != model.device:
-        raise InputError(f"{name} is on {state.particle_q.device}; the model is on {model.device}")
-    for attribute in STATE:
-        array = attribute_of(state, attribute)
-        if array is not None and len(array) != model.tet_count:
-            raise InputError(f"{name} has {attribute} of {len(array)} tetrahedra; there are {model.tet_count}")
 
 
 def _named(value: Any) -> str:
@@ -159,42 +142,9 @@ def why_none(model: newton.Model) -> str:
     labels = [str(label) for label in model.volume_label]
     named = f"{bodies} soft bod{'y' if bodies == 1 else 'ies'} ({', '.join(labels[:3])}{', ...' * (bodies > 3)})"
     return (
-        f"the model has no tetrahedra, though {named}: Newton's builder leaves out wrongly wound tetrahedra and their "
-        f"mass, and all of these are wrongly wound; {_REPAIR}"
+        f"the model has no tetrahedra, though {named}: Newton's builder leaves out those that are wrongly wound; "
+        "build with warp_corot.newton.add_mesh(builder, warp_corot.TetMesh(points, tets), ...), which repairs them"
     )
-
-
-def warn_of_lost(model: newton.Model, tets: npt.NDArray[np.integer]) -> None:
-    """Warn if soft bodies of a model seem to lack tetrahedra.
-
-    Their surface triangles were found from all tetrahedra: if some were left out, the rest have more outer faces. Or
-    particles are in no tetrahedron, and the triangles do not show that they never were in one.
-    """
-    if model.volume_particle_start is None or not len(model.volume_particle_start):
-        return
-    in_body, of_body = np.zeros(model.particle_count, bool), np.zeros(len(tets), bool)
-    ranges = (model.volume_particle_start, model.volume_particle_end, model.volume_tet_start, model.volume_tet_end)
-    for first, last, first_tet, last_tet in zip(*(array.numpy() for array in ranges), strict=True):
-        in_body[first:last] = True
-        of_body[first_tet:last_tet] = True
-    single = in_body.copy()
-    single[tets] = False
-    surface = faces = 0
-    if model.tri_count:
-        triangles = model.tri_indices.numpy().reshape(-1, 3)
-        surface = int(np.count_nonzero(in_body[triangles].all(axis=1)))
-        faces = len(boundary_faces(tets[of_body])[0])
-    lost = []
-    if single.any() and not faces == surface > 0:
-        lost.append(f"{np.count_nonzero(single)} particles of soft bodies are in no tetrahedron")
-    if faces > surface > 0:
-        lost.append(f"soft bodies with {surface} surface triangles have {faces} outer faces")
-    if lost:
-        warnings.warn(
-            f"{' and '.join(lost)}: Newton's builder leaves out wrongly wound tetrahedra and their mass; {_REPAIR}",
-            UserWarning,
-            stacklevel=5,
-        )
 
 
 class Recordings:

@@ -16,8 +16,7 @@ import warp as wp
 
 from warp_corot.elasticity.model import Kept
 from warp_corot.errors import InputError
-from warp_corot.kernels.newton import explicit_rows, rows
-from warp_corot.kernels.newton.pairs import PairLists, Surfaces, count_pair_loads, scatter_pairs
+from warp_corot.kernels.newton import explicit, rows
 from warp_corot.kernels.newton.particles import NO_ROW, UNKNOWN_BEFORE, Bodies, Particles
 from warp_corot.mesh.topology import boundary_faces, linked, node_pairs
 
@@ -32,6 +31,8 @@ PARALLEL = 1e-5
 ROUNDS = 4
 #: The stiffness of all contacts that share a particle is at most this many times the stiffness of one.
 CROWD = 4.0
+#: The most states whose bodies are remembered.
+STATES = 8
 #: Speed at which what was found too late is pushed out [m/s].
 RECOVERY = 0.25
 
@@ -57,7 +58,7 @@ class Contacts:
         self.pairs = None if margin is None else SoftPairs(model, margin)
         self.rows = wp.zeros(0, dtype=rows.Row, device=self.device)
         self.contact_count = self.count = 0
-        self._lists: PairLists | None = None
+        self._lists: explicit.PairLists | None = None
         #: Loads of particles; not needed if every contact has a particle of its own.
         self._no_load = wp.empty(0, dtype=wp.float32, device=self.device)
         self._load = self._no_load
@@ -70,7 +71,7 @@ class Contacts:
         self._slope, self._yielding, self.reactions = (
             wp.zeros(bodies, dtype=wp.spatial_vectorf, device=self.device) for _ in range(3)
         )
-        self._bodies = Kept(self._made_bodies)
+        self._bodies: dict[tuple, Bodies] = {}
         self._particles, self._shapes = _Given(Particles, "particle_", model), _Given(rows.Shapes, "shape_", model)
         self._attachments = _Given(rows.Attachments, "attachment_particle_body_", model)
         self._of_bodies = _Given(Bodies, "body_", model)
@@ -194,10 +195,10 @@ class Contacts:
             first = substep.contacts.rigid_contact_max if substep.contacts is not None else 0
             inputs = [dt, share, self.law, self.contact_count, first, self.rows, load, particles, bodies, *motion]
             outputs = [f, self.reactions, self._no_wrenches if reported is None else reported]
-            self._launch(explicit_rows.scatter_rows, self.count, inputs, outputs)
+            self._launch(explicit.scatter_rows, self.count, inputs, outputs)
         if self._lists is not None and self.pairs is not None:
             inputs = [self.pairs.surfaces, self._lists, self.law, dt, load, particles, *motion]
-            self._launch(scatter_pairs, self.pairs.size, inputs, [f, trouble])
+            self._launch(explicit.scatter_pairs, self.pairs.size, inputs, [f, trouble])
 
     def count_loads(self, state: newton.State, of_bodies: newton.State) -> wp.array:
         """Launch the count of how many contacts share each particle, if several may: float32 [P], or empty."""
@@ -211,21 +212,26 @@ class Contacts:
             self._launch(rows.count_loads, self.contact_count, inputs, [self._load])
         if self._lists is not None and self.pairs is not None:
             inputs = [self.pairs.surfaces, self._lists, self.law, state.particle_q]
-            self._launch(count_pair_loads, self.pairs.size, inputs, [self._load])
+            self._launch(explicit.count_pair_loads, self.pairs.size, inputs, [self._load])
         return self._load
 
     def bodies(self, of_bodies: newton.State) -> Bodies:
-        """Bodies in a state."""
-        return self._bodies(of_bodies.body_q, of_bodies.body_qd)
+        """Bodies in a state; made once for each of the states that take turns."""
+        arrays = of_bodies.body_q, of_bodies.body_qd
+        if arrays not in self._bodies:
+            if len(self._bodies) == STATES:
+                self._bodies.clear()
+            self._bodies[arrays] = self._made_bodies(*arrays)
+        return self._bodies[arrays]
 
     def _find_yielding(self, state: newton.State, bodies: Bodies, load: wp.array, dt: float) -> None:
         """Find how far bodies yield to springs, and at how many places they are touched."""
         self._places.zero_()
         for number in range(ROUNDS if self.contact_count else 1):
             inputs = [number, self.law, self.rows, load, state.particle_q, bodies]
-            self._launch(explicit_rows.gather_springs, self.count, inputs, [self._curvature, self._slope])
+            self._launch(explicit.gather_springs, self.count, inputs, [self._curvature, self._slope])
             inputs = [dt, bodies, self._curvature, self._slope]
-            self._launch(explicit_rows.solve_yielding, self.model.body_count, inputs, [])
+            self._launch(explicit.solve_yielding, self.model.body_count, inputs, [])
 
     def _take_law(self) -> None:
         """Take the model's present values."""
@@ -322,18 +328,19 @@ class SoftPairs:
                 "add_forest and add_mesh surface=True"
             )
         self.margin, self.device = margin, model.device
+        self._lists: _Given | None = None
         self.size = max(model.particle_count, model.edge_count)
         triangles = model.tri_indices.numpy().reshape(-1, 3)
         edges = model.edge_indices.numpy().reshape(-1, 4)
         facing = _facing(model, triangles)
-        self.surfaces = surfaces = Surfaces()
+        self.surfaces = surfaces = explicit.Surfaces()
         surfaces.triangles, surfaces.edges = model.tri_indices, model.edge_indices
         surfaces.facing = self._on_device(facing, wp.float32)
         surfaces.outward = self._on_device(_triangles_of_edges(triangles, edges, facing), wp.vec2i)
         surfaces.part = self._on_device(_parts(model, triangles), wp.int32)
         surfaces.rest = wp.clone(model.particle_q)
 
-    def lists_of(self, contacts: newton.Contacts) -> PairLists:
+    def lists_of(self, contacts: newton.Contacts) -> explicit.PairLists:
         """Newton's lists of pairs.
 
         Raises:
@@ -346,14 +353,10 @@ class SoftPairs:
                 "pipeline.init_soft_self_contact(margin=..., gap=...) before pipeline.contacts(), and "
                 "pipeline.collide(state, contacts, soft_self_contact=True)"
             )
-        lists = PairLists()
+        if self._lists is None:
+            self._lists = _Given(explicit.PairLists, "", data)
+        lists = self._lists.of(data)
         lists.margin, lists.parallel = self.margin, PARALLEL
-        lists.triangle_starts = data.vertex_colliding_triangles_offsets
-        lists.triangle_counts = data.vertex_colliding_triangles_count
-        lists.triangles = data.vertex_colliding_triangles
-        lists.edge_starts = data.edge_colliding_edges_offsets
-        lists.edge_counts = data.edge_colliding_edges_count
-        lists.edges = data.edge_colliding_edges
         return lists
 
     def _on_device(self, values: npt.NDArray[Any], dtype: type) -> wp.array:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from types import SimpleNamespace
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -16,9 +16,9 @@ from warp_corot.kernels.elements.elements import GeneralElements
 from warp_corot.kernels.elements.forces import add_stiffness_product
 from warp_corot.kernels.elements.simd8 import LANES
 from warp_corot.kernels.implicit import conjugate_gradients, increments
-from warp_corot.kernels.implicit.tangent import add_vectors, find_rest
+from warp_corot.kernels.implicit.steps import count_solves
+from warp_corot.kernels.implicit.tangent import add_vectors, find_rest, finish_blocks, finish_rows
 from warp_corot.kernels.newton import implicit as kernels
-from warp_corot.kernels.newton import implicit_rows as rows
 from warp_corot.kernels.newton.particles import Particles
 from warp_corot.mesh.topology import connected
 from warp_corot.solvers.implicit.block_system import BlockSystem
@@ -43,9 +43,6 @@ RIGID_STEP = 5e-4
 #: Worlds are solved side by side if their vectors, all as long as the longest, have at most this many times as many
 #: entries as are needed.
 PADDING = 2
-#: Fields of a row.
-FIELDS = {"nodes": wp.vec4i, "weights": wp.vec4, "body": wp.int32, "law": wp.vec4, "stiffness": wp.mat33}
-FIELDS |= {"most": wp.float32, **dict.fromkeys(("arm", "normal", "gap", "slide", "force"), wp.vec3)}
 
 
 class Unknowns:
@@ -61,6 +58,8 @@ class Unknowns:
         count: Number of entries of each.
         particle, body: Entries of particles, and of bodies' translations, int32 [P], [B].
         owner: The body of an entry, or -1, int32 [worlds * count].
+        mass: Inertia of each entry [kg/s^2], zero if it is not free, float32 [worlds * count].
+        roots: The matrix from each body's entry to its rotation, mat33 [B].
     """
 
     def __init__(self, model: newton.Model):
@@ -85,9 +84,12 @@ class Unknowns:
             wp.array(values, dtype=wp.int32, device=model.device)
             for values in (entry[:particles], np.ascontiguousarray(entry[particles::2]), owner)
         )
+        self.mass = wp.zeros(len(owner), dtype=wp.float32, device=model.device)
+        self.roots = wp.zeros(bodies, dtype=wp.mat33, device=model.device)
 
-    def __len__(self) -> int:
-        return self.worlds * self.count
+    def zeros(self, dtype: type = wp.vec4) -> wp.array:
+        """Zero in each entry."""
+        return wp.zeros(len(self.mass), dtype=dtype, device=self.mass.device)
 
 
 class TurnedPieces:
@@ -121,7 +123,7 @@ class TurnedPieces:
         self._turns = wp.zeros(count, dtype=wp.mat33, device=device)
         self._any_turns = wp.zeros(1, dtype=wp.int32, device=device)
         self.positions = wp.zeros(model.particle_count, dtype=wp.vec3, device=device)
-        self.way = wp.zeros(len(unknowns), dtype=wp.vec4, device=device)
+        self.way = unknowns.zeros()
 
     def launch(self, state: newton.State, particles: Particles, dt: float) -> None:
         """Launch the turn in a step of dt [s]; the elements' gathered positions are turned, too."""
@@ -140,25 +142,20 @@ class RowForces:
     """Forces and stiffness of rows as functions of the motions in a step: a ``SolvedContact`` of ``ContactSolve``.
 
     Args:
-        model: The model.
-        contacts: Its contacts.
+        contacts: The model's contacts.
         unknowns: The entries of vectors.
-        free: Whether an entry is free, float32 [entries].
+
+    Attributes:
+        solves: Number of linear solves of the last step after the first one, int32 [1].
     """
 
-    def __init__(self, model: newton.Model, contacts: Contacts, unknowns: Unknowns, free: wp.array):
-        self.device, self._contacts, self._unknowns = model.device, contacts, unknowns
-        self._no_wrenches = wp.empty(0, dtype=wp.spatial_vectorf, device=self.device)
-        self._rows, self._room = rows.RowSprings(), -1
-        self._rows.free = free
+    def __init__(self, contacts: Contacts, unknowns: Unknowns):
+        self.device, self._contacts, self._unknowns = contacts.device, contacts, unknowns
+        empty = (wp.spatial_vector, wp.vec4)
+        self._no_wrenches, self._no_motion = (wp.empty(0, dtype=dtype, device=self.device) for dtype in empty)
         #: Nothing changes besides forces.
-        self.changed, self._rows.solves = (wp.zeros(1, dtype=wp.int32, device=self.device) for _ in range(2))
+        self.changed, self.solves = (wp.zeros(1, dtype=wp.int32, device=self.device) for _ in range(2))
         self._make_room()
-
-    @property
-    def solves(self) -> wp.array:
-        """Number of linear solves of the last step, int32 [1]."""
-        return self._rows.solves
 
     @property
     def count(self) -> int:
@@ -166,14 +163,13 @@ class RowForces:
 
     def begin(self, step: Step, of_bodies: newton.State) -> bool:
         """Launch the rows of a step from its first state; return whether their arrays are new."""
-        contacts, state = self._contacts, step.state_in
+        contacts, state, is_new = self._contacts, step.state_in, self.count != len(self._rows.nodes)
         self._law = [step.dt, contacts.law.adhesion]
-        is_new = self.count != self._room
         if is_new:
             self._make_room()
         inputs = [step.dt, contacts.law, contacts.rows, contacts.count_loads(state, of_bodies), state.particle_q]
-        inputs += [contacts.bodies(of_bodies), self._unknowns.particle, self._unknowns.body]
-        self._launch(rows.begin_springs, inputs, [self._rows])
+        inputs += [contacts.bodies(of_bodies), self._unknowns.particle, self._unknowns.body, self._unknowns.roots]
+        self._launch(kernels.begin_springs, inputs, [self._rows])
         return is_new
 
     def report(self, step: Step, share: float) -> None:
@@ -183,10 +179,10 @@ class RowForces:
         first = 0 if step.contacts is None else step.contacts.rigid_contact_max
         inputs = [self._rows, contacts.contact_count, self._unknowns.owner, share, first]
         reported = self._no_wrenches if step.reported is None else step.reported
-        self._launch(rows.report_rows, inputs, [contacts.reactions, reported])
+        self._launch(kernels.report_rows, inputs, [contacts.reactions, reported])
 
     def add_blocks(self, blocks: wp.array) -> None:
-        self._launch(rows.add_row_blocks, [self._rows], [blocks])
+        self._launch(kernels.add_row_blocks, [self._rows], [blocks])
 
     # --- as a contact of solves, see ``SolvedContact`` ---------------------------------------------------------------
 
@@ -194,13 +190,13 @@ class RowForces:
         pass
 
     def update(self, d: wp.array, *, is_solved: bool = False) -> None:
-        self._launch(rows.update_springs, [*self._law, int(is_solved), d], [self._rows])
+        self._launch(kernels.update_springs, [*self._law, int(is_solved), d], [self._rows])
 
     def add_forces(self, y: wp.array) -> None:
-        self._launch(rows.add_row_forces, [self._rows], [y])
+        self._launch(kernels.add_row_forces, [self._rows, self._no_motion], [y])
 
     def add_products(self, x: wp.array, y: wp.array) -> None:
-        self._launch(rows.add_row_products, [self._rows, x], [y])
+        self._launch(kernels.add_row_forces, [self._rows, x], [y])
 
     def update_springs(self) -> None:
         pass
@@ -212,10 +208,10 @@ class RowForces:
         self, d: wp.array, change: wp.array, search: wp.array, slopes: wp.array, *, apart: int | None = None
     ) -> None:
         inputs = [*self._law, self._rows, self._unknowns.count, d, change, search]
-        self._launch(rows.add_row_slopes, inputs, [slopes])
+        self._launch(kernels.add_row_slopes, inputs, [slopes])
 
     def launch_going(self, d: wp.array, rounds: wp.array, most: int, going: wp.array) -> None:
-        wp.copy(self._rows.solves, rounds)
+        wp.copy(self.solves, rounds)
 
     def launch_end(self, d: wp.array) -> None:
         self.update(d, is_solved=True)
@@ -223,9 +219,12 @@ class RowForces:
     # --- pieces ------------------------------------------------------------------------------------------------------
 
     def _make_room(self) -> None:
-        self._room, made = self.count, self._rows
-        for name, dtype in FIELDS.items():
-            setattr(made, name, wp.zeros(self.count, dtype=dtype, device=self.device))
+        self._rows = made = kernels.RowSprings()
+        made.mass, made.solves = self._unknowns.mass, self.solves
+        fields: Any = kernels.RowSprings
+        for name, variable in fields.vars.items():
+            if name not in ("mass", "solves"):
+                setattr(made, name, wp.zeros(self.count, dtype=variable.type.dtype, device=self.device))
 
     def _launch(self, kernel: wp.Kernel, inputs: list, outputs: list) -> None:
         if self.count:
@@ -235,30 +234,26 @@ class RowForces:
 class StepOperator:
     """M (1/dt^2 + damping/dt) + K + D/dt, of a system whose contact adds the stiffness of rows.
 
-    Rows of entries that are not free are zero, so that the others see how these move.
+    Rows of entries that are not free are those of the identity.
 
     Args:
         model: The model.
         tetrahedra: Its elements.
         unknowns: The entries of vectors.
-        free: Whether an entry is free, float32 [entries].
         rows: Contacts and attachments, which are part of the blocks on the diagonal.
 
     Attributes:
-        inverse_mass: ``free``.
-        inertia: The first term, mat33 [entries].
+        inverse_mass: Positive if an entry is free, float32 [entries].
         damped: Whether elements are viscous.
     """
 
-    def __init__(
-        self, model: newton.Model, tetrahedra: Tetrahedra, unknowns: Unknowns, free: wp.array, rows: RowForces
-    ):
+    def __init__(self, model: newton.Model, tetrahedra: Tetrahedra, unknowns: Unknowns, rows: RowForces):
         self.device, self.worlds, self.node_count = model.device, unknowns.worlds, unknowns.count
         self._tetrahedra, self._rows, self._count = tetrahedra, rows, int(model.tet_count)
-        self.inverse_mass, self.damped = free, False
-        self.inertia, self._of_elements, self._blocks = (
-            wp.zeros(len(free), dtype=wp.mat33, device=self.device) for _ in range(3)
-        )
+        self.inverse_mass, self.damped = unknowns.mass, False
+        self._of_elements, self._blocks = (unknowns.zeros(wp.mat33) for _ in range(2))
+        scales = wp.array([1.0, 0.0, 1.0], dtype=wp.float32, device=self.device)
+        self._masses = [scales, unknowns.mass, unknowns.mass]
         self._none, self._no_list = (wp.zeros(0, dtype=dtype, device=self.device) for dtype in (wp.vec4, wp.int32))
         own, self._elements = tetrahedra.elements, GeneralElements()
         self._elements.nodes = wp.array(unknowns.particle.numpy()[tetrahedra.tets], dtype=wp.vec4i, device=self.device)
@@ -292,14 +287,14 @@ class StepOperator:
         """Launch the blocks on the diagonal, with those of rows, mat33 [entries]."""
         wp.copy(self._blocks, self._of_elements)
         self._rows.add_blocks(self._blocks)
-        self._launch(kernels.finish_blocks, len(self._blocks), [self.inverse_mass, self.inertia], [self._blocks])
+        self._launch(finish_blocks, len(self._blocks), [*self._masses, 0.0], [self._blocks])
         return self._blocks
 
     def apply(self, x: wp.array, y: wp.array) -> None:
         """Launch y = A x."""
         y.zero_()
         self.add_product(x, y)
-        self._launch(kernels.finish_rows, len(y), [self.inverse_mass, self.inertia, x], [y])
+        self._launch(finish_rows, len(y), [*self._masses, x, self._none], [y])
 
     def add_product(self, x: wp.array, y: wp.array) -> None:
         """Launch y += (K + D/dt) x."""
@@ -349,20 +344,17 @@ class ImplicitSteps(Steps):
                 "integrator='implicit' steps only tetrahedra: use integrator='explicit'"
             )
         self._unknowns = unknowns = Unknowns(model)
-        count = len(unknowns)
-        self._free = wp.zeros(count, dtype=wp.float32, device=self.device)
-        self._rows = RowForces(model, contacts, unknowns, self._free)
+        self._rows = RowForces(contacts, unknowns)
         self._turned = TurnedPieces(model, tetrahedra, unknowns)
-        self._operator = StepOperator(model, tetrahedra, unknowns, self._free, self._rows)
-        operator, contact = cast("Any", self._operator), cast("Any", self._rows)
+        self._operator = StepOperator(model, tetrahedra, unknowns, self._rows)
+        operator: Any = self._operator
+        contact: Any = self._rows
         self._system = BlockSystem([operator], [RowBlocks(operator)], contact=contact, most=ITERATIONS)
         self._system.solver.tolerance.fill_(TOLERANCE)
         self._solve = ContactSolve(self._system, [])
         self._motions = [unknowns.particle, self._system.x]
-        self._change, self._product, self._rest, self._r = (
-            wp.zeros(count, dtype=wp.vec4, device=self.device) for _ in range(4)
-        )
-        self._first = wp.zeros(unknowns.worlds, dtype=wp.int32, device=self.device)
+        self._change, self._product, self._rest, self._r = (unknowns.zeros() for _ in range(4))
+        self._first, self._rounds = (wp.zeros(unknowns.worlds, dtype=wp.int32, device=self.device) for _ in range(2))
         self._search = LineSearch(unknowns.worlds, unknowns.count, self._rows, self.device)
         # Viscous forces are those of the velocities after the step, which the solve finds.
         still = wp.zeros(model.particle_count, dtype=wp.vec3, device=self.device)
@@ -374,32 +366,32 @@ class ImplicitSteps(Steps):
         self._turned.launch(substep.state_in, self.contacts.particles, substep.dt)
         self.tetrahedra.add_forces(self._turned_state, self._activation, self._f)
         of_bodies = self._bodies_after(done, substep, given)
+        self._launch_unknowns(substep, of_bodies, given)
         if self._rows.begin(substep, of_bodies):
             self._replays.forget()
-        self._launch_unknowns(substep, of_bodies, given)
         self._replays.launch((substep.dt, self.contacts.law.adhesion, self._operator.damped), self._launch_solve)
         self._rows.report(substep, share)
         self._launch_reactions(given, share)
 
     def _launch_unknowns(self, substep: Step, of_bodies: newton.State, given: newton.State) -> None:
-        """Launch the right side, the inertia, the first motions, and a guess of how gravity changes these."""
-        model, now, dt, system = self.model, substep.state_in, substep.dt, self._system
-        outputs = [self._free, self._operator.inertia, system.b, system.x, self._change]
-        inputs = [dt, self.damping, self.contacts.particles, self._f, now.particle_qd]
-        inputs += [self.report.trouble, self._unknowns.particle]
+        """Launch the linearisation, the right side, the inertia, the first motions, and how gravity changes these."""
+        model, now, dt, system, operator = self.model, substep.state_in, substep.dt, self._system, self._operator
+        operator.take(now.particle_q, self._turned.positions, dt)
+        system.b.zero_()
+        operator.add_product(self._turned.way, system.b)
+        unknowns, trouble = self._unknowns, self.report.trouble
+        outputs = [system.b, unknowns.mass, system.x, self._change]
+        inputs = [dt, self.damping, self.contacts.particles, self._f, now.particle_qd, trouble, unknowns.particle]
         self._launch(kernels.begin_particles, model.particle_count, inputs, outputs)
         if model.body_count:
             inputs = [dt, self.contacts.bodies(of_bodies), model.gravity, given.body_f, int(self.others.has_bodies)]
-            inputs += [self.report.trouble, self._unknowns.body]
-            self._launch(kernels.begin_bodies, model.body_count, inputs, outputs)
-        self._operator.take(now.particle_q, self._turned.positions, dt)
+            inputs += [trouble, unknowns.body]
+            self._launch(kernels.begin_bodies, model.body_count, inputs, [*outputs, unknowns.roots])
 
     def _launch_solve(self) -> None:
         """Launch the solve for the motions: with the contacts that act, and then until these are the right ones."""
         operator, system, rows, x = self._operator, self._system, self._rows, self._system.x
         operator.take_diagonal()
-        operator.add_product(self._turned.way, system.b)
-        self._launch(kernels.clear_held, len(x), [self._free], [system.b])
         rows.update(x, is_solved=True)
         system.update()
         operator.apply(x, self._product)
@@ -418,9 +410,9 @@ class ImplicitSteps(Steps):
             self._launch(add_vectors, len(x), [self._change], [x])
             rows.solves.zero_()
             self._solve.iterations.zero_()
-        inputs = [self._first, self._solve.iterations, rows.solves, system.solver.status]
-        inputs.append(int(conjugate_gradients.CONVERGED))
-        self._launch(kernels.count_solves, 1, inputs, [self.totals])
+        linear, status = self._solve.iterations, system.solver.status
+        self._launch(kernels.add_first, len(status), [self._first, rows.solves], [linear, self._rounds])
+        self._launch(count_solves, 1, [self._rounds, linear, status, int(conjugate_gradients.CONVERGED)], [self.totals])
 
     def _steps_of_others(self, dt: float) -> int:
         return math.ceil(dt / RIGID_STEP) if self.others.is_own else 1

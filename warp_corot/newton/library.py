@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from types import ModuleType
-
 from warp_corot.errors import InputError
 
 
@@ -26,14 +24,5 @@ __all__ = [
     "ModelView",
     "SolverBase",
     "SolverSemiImplicit",
-    "examples",
     "newton",
 ]
-
-
-def examples() -> ModuleType:
-    """The common module of Newton's examples, which needs more packages than Newton; raises ImportError without
-    them."""
-    import newton.examples
-
-    return newton.examples

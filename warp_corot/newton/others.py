@@ -1,21 +1,24 @@
 """Everything in a model besides tetrahedra: rigid bodies and joints, springs, triangles and bending edges.
 
-Another of Newton's solvers steps these, on a view of the model without tetrahedra.
+Another of Newton's solvers steps these, on a view of the model without tetrahedra. Here are their small motions, for
+the largest stable step: the forces of ``newton.solvers.SolverSemiImplicit``, linearised about the model's positions. An
+element that is shorter or smaller there than at rest counts as if it were at rest, since that is its stiffer state; a
+longer one also has its tension across it.
 """
 
 from __future__ import annotations
 
-import copy
 import math
 import warnings
 from collections.abc import Iterator
-from contextlib import contextmanager
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import warp as wp
 
 from warp_corot.errors import InputError
-from warp_corot.kernels.newton.linear import scatter_bending, scatter_springs, scatter_triangles
+from warp_corot.kernels.newton.particles import scatter_blocks
 
 from .checks import Step
 from .library import ModelView, SolverBase, SolverSemiImplicit, newton
@@ -23,6 +26,13 @@ from .library import ModelView, SolverBase, SolverSemiImplicit, newton
 #: Effective number of contacts of a particle with others in a heap, for their total stiffness. A pair that moves
 #: against each other counts twice, and opposite contacts count with the square of the cosine of their directions.
 CONTACTS = 4.0
+#: Newton leaves out bending edges below twice this area and this length [m^2, m].
+LEAST = 1e-6
+
+Array = npt.NDArray[np.float64]
+#: Nodes of elements [E, n], the matrix from their displacements to strains [E, s, 3 n], and the stiffness and damping
+#: of these [E, s, s].
+Elements = tuple[npt.NDArray[np.int32], Array, Array, Array]
 
 
 class Others:
@@ -39,14 +49,15 @@ class Others:
         damped: Whether springs, triangles or bending edges have dampers.
         is_own: Whether the bodies' solver is the one that is made here.
         contact: Stiffness [N/m] and damping [N s/m] of each contact between particles.
-        particle_forces: The forces on particles in the step [N], vec3 [P].
+        moved: Particles as the solvers of bodies have moved them in the last step, without the forces of this package:
+            positions and velocities, vec3 [P].
     """
 
     def __init__(self, model: newton.Model, rigid_solver: SolverBase | str | None, particle_contact: bool):
         self.is_own = own = rigid_solver == "semi-implicit"
         if not own and rigid_solver is not None and not isinstance(rigid_solver, SolverBase):
             raise InputError(f"rigid_solver is {rigid_solver!r}; it must be 'semi-implicit', a solver or None")
-        self.model = model
+        self.model, self.device = model, model.device
         self._particle_contact = particle_contact
         if own or rigid_solver is None:
             _warn_of_ignored(model)
@@ -68,7 +79,9 @@ class Others:
             if not particle_contact:
                 view.particle_grid = None
             elif model.device.is_cpu and model.particle_grid is not None:
-                view.particle_grid = _grid_for(model)
+                # About as many cells as particles: clearing Newton's two million would dominate a step.
+                size = 2 ** math.ceil(math.log2(max(model.particle_count, 1)) / 3)
+                view.particle_grid = wp.HashGrid(*3 * [min(max(size, 8), 128)], device=model.device)
             if not own and model.body_count:
                 view.body_count = view.joint_count = 0
             try:
@@ -77,88 +90,71 @@ class Others:
                 raise InputError(f"{error} Give another rigid_solver, or None.") from None
         #: Copies of contacts without those of particles, by the original contacts.
         self._rigid_contacts: tuple[newton.Contacts, newton.Contacts] | None = None
-        self.particle_forces = wp.empty(model.particle_count, dtype=wp.vec3, device=model.device)
-        #: Stiffness and damping at the last ``refresh``.
-        self._seen: list[np.ndarray] = []
+        count = model.particle_count if self._solver is not None or self._rigid is not None else 0
+        self._no_forces, *self.moved = (wp.zeros(count, dtype=wp.vec3, device=model.device) for _ in range(3))
         self.refresh()
 
-    def refresh(self) -> bool:
-        """Read the current stiffness and damping of everything.
-
-        Returns:
-            Whether they have changed since the last call.
-        """
+    def refresh(self) -> None:
+        """Read the current stiffness and damping of everything."""
         model = self.model
-        present: list[np.ndarray] = [np.zeros(2)]
-        dampers = [0.0]
-        if self._particle_contact and model.particle_grid is not None:
-            present[0] = CONTACTS * np.array([model.particle_ke, model.particle_kd], np.float64)
-        if model.spring_count:
-            present += [model.spring_stiffness.numpy().copy(), model.spring_damping.numpy().copy()]
-            dampers.append(float(present[-1].max()))
-        if self._triangles:
-            present.append(model.tri_materials.numpy()[:, :3].copy())
-            dampers.append(float(present[-1][:, 2].max()))
-        if self._edges:
-            present.append(model.edge_bending_properties.numpy().copy())
-            dampers.append(float(present[-1][:, 1].max()))
-        self.contact = float(present[0][0]), float(present[0][1])
-        self.damped = max(dampers) > 0.0
-        same = len(present) == len(self._seen) and all(map(np.array_equal, present, self._seen))
-        self._seen = present
-        return not same
+        acts = self._particle_contact and model.particle_grid is not None
+        self.contact = (CONTACTS * model.particle_ke, CONTACTS * model.particle_kd) if acts else (0.0, 0.0)
+        nodes, blocks = [np.empty((0, 2), np.int32)], [np.empty((0, 2, 3, 3))]
+        for ids, strain, stiffness, damping in self._elements():
+            pairs = np.stack(np.broadcast_arrays(ids[:, :, None], ids[:, None, :]), axis=-1)
+            nodes.append(pairs.reshape(-1, 2))
+            sizes = (*ids.shape, 3, ids.shape[1], 3)
+            both = [np.einsum("esi,est,etj->eij", strain, m, strain).reshape(sizes) for m in (stiffness, damping)]
+            blocks.append(np.stack(both, axis=1).transpose(0, 2, 4, 1, 3, 5).reshape(-1, 2, 3, 3))
+        self._pairs = wp.array(np.concatenate(nodes), dtype=wp.vec2i, device=self.device)
+        found = np.concatenate(blocks)
+        self._stiffness, self._damping = (
+            wp.array(np.ascontiguousarray(found[:, k]), dtype=wp.mat33, device=self.device) for k in range(2)
+        )
+        self.damped = bool(found[:, 1].any())
 
-    def add_linear_forces(self, u: wp.array, f: wp.array, damping: bool) -> None:
-        """Add the forces of small displacements from the model's initial positions, or of velocities there, vec4 [P].
+    def add_linear_forces(self, a: float, b: float, u: wp.array, f: wp.array) -> None:
+        """Add -(a K + b C) u, with stiffness K and damping C about the model's positions, to f, both vec4 [P].
 
         Contact between particles is not included.
         """
-        model, x = self.model, self.model.particle_q
+        inputs = [self._pairs, self._stiffness, self._damping, a, b, u]
+        wp.launch(scatter_blocks, len(self._pairs), inputs, [f], device=self.device)
+
+    def _elements(self) -> Iterator[Elements]:
+        model = self.model
+        x = model.particle_q.numpy().astype(np.float64)
         if model.spring_count:
-            modulus = model.spring_damping if damping else model.spring_stiffness
-            inputs = [x, model.spring_indices, model.spring_rest_length, modulus, int(damping), u]
-            wp.launch(scatter_springs, dim=model.spring_count, inputs=inputs, outputs=[f], device=model.device)
+            arrays = model.spring_rest_length, model.spring_stiffness, model.spring_damping
+            yield _springs(x, model.spring_indices.numpy().reshape(-1, 2), *(array.numpy() for array in arrays))
         if self._triangles:
-            inputs = [x, model.tri_indices, model.tri_poses, model.tri_materials, int(damping), u]
-            wp.launch(scatter_triangles, dim=model.tri_count, inputs=inputs, outputs=[f], device=model.device)
+            yield _triangles(x, *(a.numpy() for a in (model.tri_indices, model.tri_poses, model.tri_materials)))
         if self._edges:
-            inputs = [x, model.edge_indices, model.edge_bending_properties, int(damping), u]
-            wp.launch(scatter_bending, dim=model.edge_count, inputs=inputs, outputs=[f], device=model.device)
+            yield _hinges(x, model.edge_indices.numpy().reshape(-1, 4), model.edge_bending_properties.numpy())
 
     def step(self, substep: Step, body_f: wp.array | None) -> None:
-        """Make a step with the given wrenches on bodies and forces on particles."""
-        now, out, control, contacts, dt, _ = substep
-        rigid = self._without_soft(contacts)
-        with _forces(now, self.particle_forces if self.has_particles else now.particle_f, body_f):
-            if self._solver is not None:
-                self._solver.step(now, out, control, rigid, dt)
-            if self._rigid is not None and self.has_bodies:
-                self._rigid.step(now, out, control, rigid, dt)
+        """Make a step of bodies with the given wrenches, and of particles into ``moved``."""
+        if self.has_particles:
+            self._no_forces.zero_()  # Newton's solver adds its own
+        now = with_changes(substep.state_in, particle_f=self._no_forces, body_f=body_f)
+        out = with_changes(substep.state_out, particle_q=self.moved[0], particle_qd=self.moved[1])
+        rigid = self._without_soft(substep.contacts)
+        if self._solver is not None:
+            self._solver.step(now, out, substep.control, rigid, substep.dt)
+        if self._rigid is not None and self.has_bodies:
+            self._rigid.step(now, out, substep.control, rigid, substep.dt)
 
-    def notify_model_changed(self, flags: int) -> None:
-        for solver in (self._solver, self._rigid):
-            if solver is not None:
-                solver.notify_model_changed(flags)
-
-    def reset(self, state: newton.State, world_mask: wp.array | None, flags: int | None) -> None:
-        for solver in (self._solver, self._rigid):
-            if solver is not None:
-                solver.reset(state, world_mask, flags)
+    @property
+    def solvers(self) -> list[SolverBase]:
+        """The solvers that step all this."""
+        return [solver for solver in (self._solver, self._rigid) if solver is not None]
 
     def _without_soft(self, contacts: newton.Contacts | None) -> newton.Contacts | None:
         if contacts is None:
             return None
         if self._rigid_contacts is None or self._rigid_contacts[0] is not contacts:
-            rigid = copy.copy(contacts)
-            rigid.soft_contact_max = 0
-            self._rigid_contacts = contacts, rigid
+            self._rigid_contacts = contacts, with_changes(contacts, soft_contact_max=0)
         return self._rigid_contacts[1]
-
-
-def _grid_for(model: newton.Model) -> wp.HashGrid:
-    """A grid with about as many cells as particles: clearing Newton's two million cells would dominate a step."""
-    size = 2 ** math.ceil(math.log2(max(model.particle_count, 1)) / 3)
-    return wp.HashGrid(*3 * [min(max(size, 8), 128)], device=model.device)
 
 
 def _warn_of_ignored(model: newton.Model) -> None:
@@ -173,12 +169,87 @@ def _warn_of_ignored(model: newton.Model) -> None:
         )
 
 
-@contextmanager
-def _forces(state: newton.State, particle_f: wp.array | None, body_f: wp.array | None) -> Iterator[None]:
-    """Replace a state's forces inside the block."""
-    kept = state.particle_f, state.body_f
-    state.particle_f, state.body_f = particle_f, body_f
-    try:
-        yield
-    finally:
-        state.particle_f, state.body_f = kept
+def with_changes(given: Any, **changes: Any) -> Any:
+    """An object with the same attributes but for some; faster than ``copy.copy``, since it is made in every substep."""
+    made = object.__new__(type(given))
+    made.__dict__.update(vars(given), **changes)
+    return made
+
+
+# --- small motions ---------------------------------------------------------------------------------------------------
+
+
+def _springs(x: Array, ends: npt.NDArray[np.int32], rest: Array, stiffness: Array, damping: Array) -> Elements:
+    """K = k (d d^T + (1 - L/l) (1 - d d^T)) for the difference of a spring's ends and its direction d."""
+    used = (ends >= 0).all(axis=1)
+    ends, rest, stiffness, damping = ends[used], rest[used], stiffness[used], damping[used]
+    along, length = _split(x[ends[:, 0]] - x[ends[:, 1]])
+    whole = _outer(along, along)
+    tension = np.where(length > rest, 1.0 - rest / np.maximum(length, LEAST), 0.0)[:, None, None]
+    strain = np.broadcast_to(np.hstack([np.eye(3), -np.eye(3)]), (len(ends), 3, 6))
+    k, c = (a[:, None, None] for a in (stiffness, damping))
+    return ends, strain, k * (whole + tension * (np.eye(3) - whole)), c * whole
+
+
+def _triangles(x: Array, nodes: npt.NDArray[np.int32], pose: Array, materials: Array) -> Elements:
+    """K of the energy A (k_mu/2 F:F + k_lambda/2 (J - 1 - k_mu/k_lambda)^2), J = |F1 x F2|, and dampers of F and J."""
+    nodes, materials = nodes.reshape(-1, 3), materials.astype(np.float64)
+    mu, lam, rate = (m[:, None, None] for m in (materials[:, 0], np.maximum(materials[:, 1], 0.0), materials[:, 2]))
+    ends = np.concatenate([-pose.sum(axis=1, keepdims=True), pose], axis=1)  # [E, 3 nodes, 2 columns of F]
+    strain = np.einsum("eka,ij->eaikj", ends, np.eye(3)).reshape(-1, 6, 9)
+    area = (0.5 / np.linalg.det(pose))[:, None, None]
+    f1, f2 = np.einsum("eka,eki->aei", ends, x[nodes])
+    n, ratio = _split(np.cross(f1, f2))
+    flat = (ratio < LEAST)[:, None, None]  # there is no normal: at rest no strain is stiffer than the largest modulus
+    smaller = np.sqrt(np.clip(ratio, LEAST, 1.0))[:, None]
+    f1, f2, ratio = f1 / smaller, f2 / smaller, np.maximum(ratio, 1.0)[:, None, None]
+    widening = np.hstack([np.cross(f2, n), np.cross(n, f1)])
+    widening = _outer(widening, widening)
+    # Of the normal, which turns with the columns of F.
+    turning = (np.eye(3) - _outer(n, n)) @ np.concatenate([-_skew(f2), _skew(f1)], axis=2) / ratio
+    across = np.concatenate([_skew(f2) @ turning, -_skew(f1) @ turning], axis=1)
+    across[:, :3, 3:] -= _skew(n)
+    across[:, 3:, :3] += _skew(n)
+    tension = np.where(lam > 0.0, lam * (ratio - 1.0) - mu, 0.0)
+    stiffness = mu * np.eye(6) + lam * widening + tension * across
+    damping = rate * (np.eye(6) + (lam > 0.0) * widening)
+    stiffness = np.where(flat, 2.0 * np.maximum(mu, lam) * np.eye(6), stiffness)
+    return nodes, strain, area * stiffness, area * np.where(flat, 3.0 * rate * np.eye(6), damping)
+
+
+def _hinges(x: Array, nodes: npt.NDArray[np.int32], properties: Array) -> Elements:
+    """Dihedral angles near their rest values.
+
+    Newton's forces are e k (theta - theta_0) d, where d is the angle's gradient g with lengths in place of inverse
+    heights: K = e k d g^T. The symmetric part (K + K^T) / 2, used here, has an eigenvalue at least as large as the real
+    part of any of K.
+    """
+    used = (nodes >= 0).all(axis=1)
+    nodes, properties = nodes[used], properties[used].astype(np.float64)
+    i, j, k, o = (x[nodes[:, c]] for c in range(4))
+    n1, double1 = _split(np.cross(k - i, o - i))
+    n2, double2 = _split(np.cross(o - j, k - j))
+    e, length = _split(o - k)
+    acts = (double1 >= LEAST) & (double2 >= LEAST) & (length >= LEAST)
+    shares = [[-length, 0 * length], [0 * length, -length]]
+    shares += [[np.einsum("ei,ei->e", p - c, e) * s for c in (i, j)] for p, s in ((o, 1.0), (k, -1.0))]
+    parts = np.einsum("nhe,hei->hein", np.array(shares), np.stack([n1, n2])).transpose(0, 1, 3, 2)
+    heights = np.maximum([double1, double2], LEAST)[:, :, None, None]
+    strain = np.stack([parts.sum(axis=0), (parts / heights).sum(axis=0)], axis=1).reshape(len(nodes), 2, 12)
+    k_e, k_d = (np.where(acts, length * column, 0.0)[:, None, None] for column in properties.T[:2])
+    return nodes, strain, k_e * [[0.0, 0.5], [0.5, 0.0]], k_d * [[1.0, 0.0], [0.0, 0.0]]
+
+
+def _split(vectors: Array) -> tuple[Array, Array]:
+    """Directions of vectors and their lengths."""
+    length = np.linalg.norm(vectors, axis=1)
+    return vectors / np.where(length > 0.0, length, 1.0)[:, None], length
+
+
+def _outer(a: Array, b: Array) -> Array:
+    return a[:, :, None] * b[:, None, :]
+
+
+def _skew(v: Array) -> Array:
+    """The matrices of the products v x."""
+    return np.cross(v[:, None, :], np.eye(3)).swapaxes(1, 2)

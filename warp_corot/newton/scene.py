@@ -4,8 +4,7 @@ namespace ``warp_corot``."""
 from __future__ import annotations
 
 import math
-from numbers import Real
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypedDict, Unpack
 
 import numpy as np
 import numpy.typing as npt
@@ -14,10 +13,10 @@ from scipy.spatial.transform import Rotation
 
 from warp_corot.discretization.discretization import centroids, lumped_masses
 from warp_corot.errors import InputError
-from warp_corot.inputs.checks import checked_indices
+from warp_corot.inputs.checks import checked_indices, checked_number, checked_numbers, checked_vector, shown
 from warp_corot.materials.isotropic import Isotropic
 from warp_corot.mesh import TetForest, TetMesh
-from warp_corot.mesh.topology import boundary_faces, signed_volumes
+from warp_corot.mesh.topology import boundary_faces, right_handed, signed_volumes
 
 from .library import newton
 
@@ -36,19 +35,19 @@ class Added(NamedTuple):
     tetrahedra: range
 
 
-def add_forest(
-    builder: newton.ModelBuilder,
-    mesh: TetForest,
-    material: Isotropic,
-    *,
-    pos: npt.ArrayLike = (0.0, 0.0, 0.0),
-    rot: npt.ArrayLike = (0.0, 0.0, 0.0, 1.0),
-    vel: npt.ArrayLike = (0.0, 0.0, 0.0),
-    k_damp: npt.ArrayLike = 0.0,
-    fixed: npt.ArrayLike | None = None,
-    particle_radius: float | None = None,
-    surface: bool = True,
-) -> Added:
+class Placing(TypedDict, total=False):
+    """Options of ``add_forest`` and ``add_mesh``."""
+
+    pos: npt.ArrayLike
+    rot: npt.ArrayLike
+    vel: npt.ArrayLike
+    k_damp: npt.ArrayLike
+    fixed: npt.ArrayLike | None
+    particle_radius: float | None
+    surface: bool
+
+
+def add_forest(builder: newton.ModelBuilder, mesh: TetForest, material: Isotropic, **placing: Unpack[Placing]) -> Added:
     """Add an adaptive forest. ``SolverCorotated`` steps it by its subtrees, several times as fast as other tetrahedra.
 
     For any other solver it consists of ordinary tetrahedra. Tetrahedra that are partly filled have the stiffness and
@@ -58,13 +57,11 @@ def add_forest(
         builder: The builder; it can be added to other builders and replicated afterwards.
         mesh: The forest.
         material: Its material; Lamé's parameters become ``k_mu`` and ``k_lambda``.
-        pos: Position of the mesh's origin [m].
-        rot: Rotation, a unit quaternion (x, y, z, w).
-        vel: Velocity of all its particles [m/s].
-        k_damp: Viscosity [Pa s], a number or [T].
-        fixed: Nodes without mass, which are kinematic: mask bool [N] or indices.
-        particle_radius: Radius for contact [m], zero or positive; None: the builder's default.
-        surface: Whether to add triangles and edges without stiffness at its boundary, for viewers and contact.
+        placing: ``pos``: position of the mesh's origin [m], (0, 0, 0) by default. ``rot``: rotation, a unit quaternion
+            (x, y, z, w). ``vel``: velocity of all its particles [m/s], zero. ``k_damp``: viscosity [Pa s], a number or
+            [T], zero. ``fixed``: nodes without mass, which are kinematic: mask bool [N] or indices.
+            ``particle_radius``: radius for contact [m], zero or positive; None: the builder's default. ``surface``:
+            whether to add triangles and edges without stiffness at its boundary, for viewers and contact; True.
 
     Returns:
         The particles and tetrahedra, in the forest's order.
@@ -75,10 +72,10 @@ def add_forest(
     """
     if not isinstance(mesh, TetForest):
         raise InputError(f"mesh is a {type(mesh).__name__}; add_forest takes a TetForest, add_mesh any tetrahedra")
-    added = _add(builder, mesh, material, pos, rot, vel, k_damp, fixed, particle_radius, surface)
+    added = _add(builder, mesh, material, **placing)
     register_forests(builder)
-    starts = {"forest_particle": added.particles.start, "forest_tet": added.tetrahedra.start}
-    row = {"forest": ForestName.of(mesh), **starts}
+    row = {"forest": ForestName.of(mesh), "forest_particle": added.particles.start}
+    row["forest_tet"] = added.tetrahedra.start
     builder.add_custom_values(**{f"{NAMESPACE}:{name}": value for name, value in row.items()})
     if mesh.fill is not None:
         values = builder.custom_attributes[f"{NAMESPACE}:fill"].values
@@ -88,9 +85,19 @@ def add_forest(
     return added
 
 
-def add_mesh(
+def add_mesh(builder: newton.ModelBuilder, mesh: TetMesh, material: Isotropic, **placing: Unpack[Placing]) -> Added:
+    """Add general tetrahedra. ``TetMesh`` has repaired wrongly wound ones, which Newton's builder leaves out.
+
+    Arguments, result and errors are those of ``add_forest``.
+    """
+    if not isinstance(mesh, TetMesh):
+        raise InputError(f"mesh is a {type(mesh).__name__}; add_mesh takes a TetMesh")
+    return _add(builder, mesh, material, **placing)
+
+
+def _add(
     builder: newton.ModelBuilder,
-    mesh: TetMesh,
+    mesh: TetForest | TetMesh,
     material: Isotropic,
     *,
     pos: npt.ArrayLike = (0.0, 0.0, 0.0),
@@ -101,27 +108,6 @@ def add_mesh(
     particle_radius: float | None = None,
     surface: bool = True,
 ) -> Added:
-    """Add general tetrahedra. ``TetMesh`` has repaired wrongly wound ones, which Newton's builder leaves out.
-
-    Arguments, result and errors are those of ``add_forest``.
-    """
-    if not isinstance(mesh, TetMesh):
-        raise InputError(f"mesh is a {type(mesh).__name__}; add_mesh takes a TetMesh")
-    return _add(builder, mesh, material, pos, rot, vel, k_damp, fixed, particle_radius, surface)
-
-
-def _add(
-    builder: newton.ModelBuilder,
-    mesh: TetForest | TetMesh,
-    material: Isotropic,
-    pos: npt.ArrayLike,
-    rot: npt.ArrayLike,
-    vel: npt.ArrayLike,
-    k_damp: npt.ArrayLike,
-    fixed: npt.ArrayLike | None,
-    radius: float | None,
-    surface: bool,
-) -> Added:
     if not isinstance(builder, newton.ModelBuilder):
         raise InputError(f"builder is {builder!r}; it must be a newton.ModelBuilder")
     if not isinstance(material, Isotropic):
@@ -131,13 +117,15 @@ def _add(
     share, count = mesh_fill(mesh), len(mesh.tets)
     columns = [np.broadcast_to(np.ravel(share * a), count) for a in (material.mu, material.lam)]
     columns.append(np.broadcast_to(_damping(k_damp, count), count))
-    velocity = tuple(_vector(vel, 3, "vel"))
-    x = mesh.points @ _rotation(rot).T + _vector(pos, 3, "pos")
+    velocity = tuple(checked_vector(vel, "vel", "m/s"))
+    x = mesh.points @ _rotation(rot).T + checked_vector(pos, "pos")
     masses = lumped_masses(mesh, material).copy()
     if fixed is not None:
         masses[checked_indices(fixed, len(x), "node")] = 0.0
-    radii = None if radius is None else [_radius(radius)] * len(x)
-    tets = right_handed(mesh)
+    if particle_radius is not None and not 0.0 <= checked_number(particle_radius, "particle_radius", "m") < np.inf:
+        raise InputError(f"particle_radius is {particle_radius!r}; it must be zero or a positive number [m], or None")
+    radii = None if particle_radius is None else [float(particle_radius)] * len(x)
+    tets = outward_tets(mesh)
     _check_resolved(x, tets, pos)
     first, first_tet = builder.particle_count, builder.tet_count
 
@@ -151,14 +139,11 @@ def _add(
     builder.tet_materials.extend(map(tuple, np.stack(columns, axis=1).tolist()))
     if surface:
         faces = boundary_faces(mesh.tets, mesh.points)[0] + first
-        nothing = [0.0] * len(faces)
-        i, j, k = (column.tolist() for column in faces.T)
-        builder.add_triangles(
-            i, j, k, tri_ke=nothing, tri_ka=nothing, tri_kd=nothing, tri_drag=nothing, tri_lift=nothing
-        )
+        nothing = dict.fromkeys(("tri_ke", "tri_ka", "tri_kd", "tri_drag", "tri_lift"), [0.0] * len(faces))
+        builder.add_triangles(*faces.T.tolist(), **nothing)
         sides = _edges_of(faces)
-        nothing = [0.0] * len(sides)
-        builder.add_edges(*sides.T.tolist(), rest=nothing, edge_ke=nothing, edge_kd=nothing)
+        nothing = dict.fromkeys(("rest", "edge_ke", "edge_kd"), [0.0] * len(sides))
+        builder.add_edges(*sides.T.tolist(), **nothing)
     return Added(range(first, first + len(x)), range(first_tet, first_tet + count))
 
 
@@ -180,12 +165,9 @@ def mesh_fill(mesh: TetForest | TetMesh) -> Any:
     return 1.0 if fill is None else fill
 
 
-def right_handed(mesh: TetForest | TetMesh) -> npt.NDArray[np.int32]:
+def outward_tets(mesh: TetForest | TetMesh) -> npt.NDArray[np.int32]:
     """The mesh's elements with positive volume, as Newton needs them; half of a forest's are mirrored. int32 [T, 4]."""
-    tets = np.array(mesh.tets)
-    mirrored = signed_volumes(mesh.points, tets) < 0
-    tets[mirrored] = tets[mirrored][:, [0, 1, 3, 2]]
-    return tets
+    return right_handed(np.array(mesh.tets), signed_volumes(mesh.points, mesh.tets) < 0)
 
 
 def _check_resolved(x: npt.NDArray[np.float64], tets: npt.NDArray[np.int32], pos: npt.ArrayLike) -> None:
@@ -202,44 +184,23 @@ def _check_resolved(x: npt.NDArray[np.float64], tets: npt.NDArray[np.int32], pos
 
 def _rotation(given: npt.ArrayLike) -> npt.NDArray[np.float64]:
     """The matrix of a quaternion (x, y, z, w) with unit length to float32 rounding, float64 [3, 3]."""
-    rot = _vector(given, 4, "rot")
-    norm = float(np.linalg.norm(rot))
-    if abs(norm - 1.0) > 1e-3:
-        raise InputError(f"rot is {given!r}, of length {norm:.4g}; it must be a unit quaternion (x, y, z, w)")
+    wanted = "it must be a unit quaternion (x, y, z, w)"
+    rot = checked_numbers(given, "rot", "[4]").ravel()
+    norm = float(np.linalg.norm(rot)) if rot.shape == (4,) else math.nan
+    if not abs(norm - 1.0) <= 1e-3:
+        raise InputError(f"rot is {shown(given)}, of length {norm:.4g}; {wanted}")
     return np.asarray(Rotation.from_quat(rot).as_matrix())
-
-
-def _radius(given: float) -> float:
-    if isinstance(given, bool) or not isinstance(given, Real) or not (math.isfinite(given) and given >= 0):
-        raise InputError(f"particle_radius is {given!r}; it must be zero or a positive number [m], or None")
-    return float(given)
 
 
 def _damping(given: npt.ArrayLike, count: int) -> npt.NDArray[np.float64]:
     """k_damp [Pa s], float64 [1] or [count]."""
-    values = _numbers(given)
-    wanted = f"k_damp must be zero or positive [Pa s], a number or one for each of {count} tetrahedra"
-    if values is None or values.size not in (1, count):
-        raise InputError(f"{wanted}; it is {repr(given) if np.ndim(given) == 0 else f'of shape {np.shape(given)}'}")
+    wanted = f"zero or positive [Pa s], a number or one for each of {count} tetrahedra"
+    values = checked_numbers(given, "k_damp", wanted).ravel()
     bad = np.flatnonzero(~(np.isfinite(values) & (values >= 0)))
-    if len(bad):
-        raise InputError(f"{wanted}; it is {values[bad[0]]:g}{f' in {bad[0]}' if values.size > 1 else ''}")
+    if len(bad) or values.size not in (1, count):
+        said = f"{values[bad[0]]:g} in {bad[0]}" if len(bad) else f"of shape {np.shape(given)}"
+        raise InputError(f"k_damp is {said}; it must be {wanted}")
     return values
-
-
-def _vector(given: npt.ArrayLike, size: int, name: str) -> npt.NDArray[np.float64]:
-    values = _numbers(given)
-    if values is None or values.shape != (size,) or not np.isfinite(values).all():
-        raise InputError(f"{name} is {given!r}; it must be {size} finite numbers")
-    return values
-
-
-def _numbers(given: npt.ArrayLike) -> npt.NDArray[np.float64] | None:
-    """Numbers as a flat array, float64 [n], or None if the input has no numbers."""
-    try:
-        return np.asarray(given, dtype=np.float64).ravel()
-    except (TypeError, ValueError):
-        return None
 
 
 class ForestName(str):

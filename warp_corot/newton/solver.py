@@ -6,10 +6,12 @@ import math
 import warnings
 from typing import Any
 
+import numpy as np
 import warp as wp
 
 from warp_corot.errors import InputError
 from warp_corot.inputs.checks import refuse_tape
+from warp_corot.kernels.newton.rows import sum_by_shape
 from warp_corot.simulation.energy import Solves
 
 from .checks import Recordings, Step, check_options, check_step, checked_dt, checked_mask
@@ -49,10 +51,9 @@ class SolverCorotated(SolverBase, CouplingInterface):
     it needed when it was recorded, and at least half as many more as at rest; ``check`` warns if these were too few.
 
     A world is stepped completely or not at all: if a value is not finite, or a particle moves farther in a substep
-    than the largest body is long, the state of the world stays unchanged. On the CPU the step is then repeated with up
-    to 16 times the substeps, and ``step`` reports if that does not help. On CUDA, where the world has missed a step by
-    then, a later ``step`` warns and uses twice the substeps; ``check`` raises an error. With given substeps it is an
-    error at once, on CUDA from a later ``step`` or ``check``. There are no gradients.
+    than the largest body is long, the state of the world stays unchanged. On the CPU ``step`` then raises an error; on
+    CUDA, where the world has missed a step by then, ``check`` does, and a later ``step`` only warns unless substeps are
+    given. If they are not, all later steps have twice as many. There are no gradients.
 
     With ``integrator="implicit"`` a step is one step of backward Euler, or ``substeps`` of them, stable at any length.
     Elastic forces are linearised once; contacts, attachments and damping are those of the end of the step. These forces
@@ -140,7 +141,10 @@ class SolverCorotated(SolverBase, CouplingInterface):
         self._steps = ImplicitSteps(*parts) if self._is_implicit else Steps(*parts)
         follows = substeps is None and not self._is_implicit
         self._following = Following(model, self.tetrahedra) if follows else None
+        self._shape_wrenches = wp.zeros(model.shape_count, dtype=wp.spatial_vectorf, device=self.device)
         self._all_worlds = wp.ones(max(int(model.world_count), 1) + 1, dtype=wp.bool, device=self.device)
+        self._seen: list[np.ndarray] = []
+        self._has_changed()
         self._find_stable_steps()
 
     @property
@@ -173,6 +177,33 @@ class SolverCorotated(SolverBase, CouplingInterface):
     def solves(self) -> Solves:
         """The cost of implicit steps so far; waits for the device. All zero with ``integrator="explicit"``."""
         return Solves(*(int(count) for count in self._steps.totals.numpy()))
+
+    def shape_wrenches(self, contacts: newton.Contacts, observables: Any) -> wp.array:
+        """Launch the sums of the soft contacts' mean wrenches in a step, and give them, spatial_vector [S].
+
+        ``contact_f`` of ``observables`` has those of single contacts, from entry ``contacts.rigid_contact_max`` on.
+
+        Args:
+            contacts: The contacts of the step.
+            observables: The container that the step wrote, made with ``{"contact_f"}``.
+
+        Returns:
+            Of each shape, on its body [N, N m]; an array that the next call uses again.
+
+        Raises:
+            InputError: The container has no contact forces, or those of other contacts.
+        """
+        wrenches = getattr(observables, "contact_f", None)
+        if wrenches is None or observables.contacts is not contacts:
+            raise InputError(
+                "observables has no contact_f of these contacts: make it by solver.observables({'contact_f'}, "
+                "contacts=contacts) and give it to solver.step"
+            )
+        self._shape_wrenches.zero_()
+        inputs = [contacts.soft_contact_count, contacts.soft_contact_shape, contacts.rigid_contact_max, wrenches]
+        outputs = [self._shape_wrenches]
+        wp.launch(sum_by_shape, contacts.soft_contact_max, inputs, outputs, device=self.device)
+        return self._shape_wrenches
 
     @property
     def body_reactions(self) -> wp.array:
@@ -218,10 +249,7 @@ class SolverCorotated(SolverBase, CouplingInterface):
         self._steps.report.check_earlier(following)
         self._see_surfaces(contacts)
         count = self._count_for(dt)
-        if following is not None and self.device.is_cpu and not self.device.is_capturing:
-            self._steps.launch_retried(step, following)
-        else:
-            self._steps.launch(step, count, following)
+        self._steps.launch(step, count, following)
         self._recordings.follow(state_in, state_out)
         if self.device.is_cpu and not self.device.is_capturing:
             self.check()
@@ -268,7 +296,8 @@ class SolverCorotated(SolverBase, CouplingInterface):
         """
         mask = self._all_worlds if world_mask is None else checked_mask(world_mask, self.model)
         self._steps.reset(state, mask, int(newton.StateFlags.ALL if flags is None else flags))
-        self._others.reset(state, world_mask, flags)
+        for solver in self._others.solvers:
+            solver.reset(state, world_mask, flags)
 
     def write_attributes(self, state: newton.State) -> None:
         """Write rotations and stresses for a state's positions into it; ``step`` does so for ``state_out``.
@@ -288,14 +317,15 @@ class SolverCorotated(SolverBase, CouplingInterface):
         Raises:
             InputError: As in the constructor.
         """
-        self._others.notify_model_changed(flags)
+        for solver in self._others.solvers:
+            solver.notify_model_changed(flags)
         if self.device.is_capturing:
             return
         bits = newton.ModelFlags
-        elements, before = False, (self._contacts.stiffest, self._contacts.lightest)
-        if flags & bits.MODEL_PROPERTIES:
-            changed = [self.tetrahedra.refresh(), self._others.refresh()]
-            elements = any(changed)
+        before, elements = (self._contacts.stiffest, self._contacts.lightest), bool(flags & bits.MODEL_PROPERTIES)
+        if elements and (elements := self._has_changed()):
+            self.tetrahedra.refresh()
+            self._others.refresh()
         of_contacts = bits.SHAPE_PROPERTIES | bits.CONSTRAINT_PROPERTIES | bits.MODEL_PROPERTIES
         if flags & (of_contacts | bits.BODY_PROPERTIES | bits.BODY_INERTIAL_PROPERTIES):
             self._contacts.refresh()
@@ -312,6 +342,15 @@ class SolverCorotated(SolverBase, CouplingInterface):
         return True
 
     # --- pieces ----------------------------------------------------------------------------------------------------
+
+    def _has_changed(self) -> bool:
+        """Whether materials of elements or masses differ from those of the last call."""
+        model, before = self.model, self._seen
+        arrays = [model.tet_materials, model.particle_inv_mass, model.spring_stiffness, model.spring_damping]
+        arrays += [model.tri_materials, model.edge_bending_properties]
+        self._seen = [np.array([model.particle_ke, model.particle_kd])]
+        self._seen += [array.numpy().copy() for array in arrays if array is not None]
+        return len(before) != len(self._seen) or not all(map(np.array_equal, before, self._seen))
 
     def _find_stable_steps(self) -> None:
         given = self._given_stable_dt

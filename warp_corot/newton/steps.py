@@ -17,7 +17,7 @@ from warp_corot.solvers.recorded import FlushedSubnormals, Replays
 from .checks import Step
 from .contact import Contacts
 from .library import newton
-from .others import Others
+from .others import Others, with_changes
 from .substeps import RETRIES, Following
 from .tetrahedra import Tetrahedra
 
@@ -26,8 +26,8 @@ RUNAWAY = float(kernels.RUNAWAY)
 #: Fewer substeps are not recorded, since recording one takes as long as several.
 FEW = 32
 #: Kernels over the states of particles and of bodies.
-OF_PARTICLES = kernels.state_kernels(wp.vec3, wp.vec3)
-OF_BODIES = kernels.state_kernels(wp.transform, wp.spatial_vector)
+FINISH_PARTICLES, RESET_PARTICLES = kernels.state_kernels(wp.vec3, wp.vec3)
+FINISH_BODIES, RESET_BODIES = kernels.state_kernels(wp.transform, wp.spatial_vector)
 #: What there is no room for, and what to do.
 _NO_ROOM = {
     int(kernels.TOO_MANY_PAIRS): "pairs of soft bodies than Newton has room for: call pipeline.init_soft_self_contact "
@@ -68,13 +68,11 @@ class Steps:
         #: Where particles' motions are and what they are, if they are solved for.
         self._motions = [wp.empty(0, dtype=dtype, device=self.device) for dtype in (wp.int32, wp.vec4)]
         self._no_numbers = wp.empty(0, dtype=wp.float32, device=self.device)
-        kept = p if others.has_particles else 0
-        self._kept_particles = [wp.empty(kept, dtype=dtype, device=self.device) for dtype in types]
         self._body_f = wp.empty(b, dtype=wp.spatial_vector, device=self.device)
         of_bodies = (wp.transform, wp.spatial_vector)
-        self._bodies_before = [wp.empty(b, dtype=dtype, device=self.device) for dtype in of_bodies]
         self._moved = SimpleNamespace(body_q=wp.empty(b, dtype=wp.transform, device=self.device), body_qd=None)
-        self._kept_bodies = [wp.empty(b, dtype=dtype, device=self.device) for dtype in of_bodies]
+        #: Bodies within a step: their solver never overwrites those before it.
+        self._bodies_made = [wp.empty(b, dtype=dtype, device=self.device) for dtype in of_bodies]
 
     def launch(self, step: Step, count: int, following: Following | None = None) -> None:
         """Launch a step of ``count`` substeps. A failure in one substep of a world undoes and ends the world's step.
@@ -87,31 +85,14 @@ class Steps:
         with self._flushed():
             self._launch_step(step, count, following)
 
-    def launch_retried(self, step: Step, following: Following) -> None:
-        """Launch a step on the CPU, and repeat it after a failure, each time with twice the substeps."""
-        state_in, dt = step.state_in, step.dt
-        kept = self.model.body_count and not self.others.has_bodies
-        if kept:
-            wp.copy(self._body_f, state_in.body_f)
-        share = following.share
-        for attempt in range(RETRIES + 1):
-            self.launch(step, following.count_for(dt), following)
-            if not self.report.is_unstable:
-                return
-            if attempt == RETRIES:
-                break
-            following.share *= 0.5
-            self.report.forget_unstable()
-            self._bring_back(state_in, step.state_out)
-            if kept:
-                wp.copy(state_in.body_f, self._body_f)
-        following.share = share
-
     def _launch_step(self, step: Step, count: int, following: Following | None) -> None:
         state_in, state_out, dt = step.state_in, step.state_out, step.dt
         if step.reported is not None:
             step.reported.zero_()
         before = self._launch_begin(step)
+        if self.others.has_bodies:
+            made = with_changes(state_out, body_q=self._bodies_made[0], body_qd=self._bodies_made[1])
+            step = step._replace(state_out=made)
         replays = Replays(self.device)
         now, number, left, done, each = state_in, 0, count, 0.0, dt / count
         while left:
@@ -120,7 +101,7 @@ class Steps:
                 # All substeps until the next measurement are alike.
                 replays.launch(each, partial(self._launch_substep, step, now, each, before, following))
             else:
-                copied = number == 0 and before[0] is self._particles_before
+                copied = number == 0 and before is self._particles_before
                 self._launch_gathering(now, state_in, number, copied)
                 if due and following is not None:
                     following.measure(now, dt - done, each)
@@ -129,81 +110,70 @@ class Steps:
                         each = (dt - done) / left
                 self._launch_gathered(step, now, each, before, following, done)
             number, left, done = number + 1, left - 1, done + each
-            now = state_out
+            now = step.state_out
+        if self.others.has_bodies:
+            inputs = [self.model.body_world, self.report.trouble, state_in.body_q, state_in.body_qd]
+            outputs = [state_out.body_q, state_out.body_qd]
+            self._launch(FINISH_BODIES, self.model.body_count, [*inputs, *self._bodies_made], outputs)
         self.tetrahedra.write_attributes(state_out)
         if following is not None:
             following.made = number
         self.report.launch()
 
     def _launch_substep(
-        self, step: Step, now: newton.State, each: float, before: tuple, following: Following | None
+        self, step: Step, now: newton.State, each: float, before: list, following: Following | None
     ) -> None:
         """Launch a substep that is not the first one."""
         self._launch_gathering(now, step.state_in, 1, False)
         self._launch_gathered(step, now, each, before, following, 0.0)
 
     def _launch_gathered(
-        self, step: Step, now: newton.State, each: float, before: tuple, following: Following | None, done: float
+        self, step: Step, now: newton.State, each: float, before: list, following: Following | None, done: float
     ) -> None:
         """Launch a substep from gathered positions, after some time of the step [s]."""
         substep = step._replace(state_in=now, dt=each)
         self._launch_forces(substep, step.state_in, each / step.dt, done)
         self._launch_motion(substep, RUNAWAY if following is None else min(RUNAWAY, following.reach / each))
-        self._launch_undoing(step.state_out, *before)
+        self._launch_undoing(step.state_out, before)
 
     def reset(self, state: newton.State, mask: wp.array, flags: int) -> None:
-        model, bits = self.model, newton.StateFlags
+        bits = newton.StateFlags
         self.contacts.forget()
         if flags & bits.PARTICLE:
-            wanted = [int(bool(flags & bit)) for bit in (bits.PARTICLE_Q, bits.PARTICLE_QD)]
-            inputs = [mask, model.particle_world, *wanted, model.particle_q, model.particle_qd]
-            outputs = [state.particle_q, state.particle_qd]
-            self._launch(OF_PARTICLES.reset, model.particle_count, inputs, outputs)
+            self._reset(RESET_PARTICLES, "particle", mask, state, flags & bits.PARTICLE_Q, flags & bits.PARTICLE_QD)
             self.tetrahedra.write_attributes(state)
         if self.others.has_bodies and flags & (bits.BODY_Q | bits.BODY_QD):
-            wanted = [int(bool(flags & bit)) for bit in (bits.BODY_Q, bits.BODY_QD)]
-            inputs = [mask, model.body_world, *wanted, model.body_q, model.body_qd]
-            self._launch(OF_BODIES.reset, model.body_count, inputs, [state.body_q, state.body_qd])
+            self._reset(RESET_BODIES, "body", mask, state, flags & bits.BODY_Q, flags & bits.BODY_QD)
+
+    def _reset(
+        self, kernel: wp.Kernel, of: str, mask: wp.array, state: newton.State, with_q: int, with_qd: int
+    ) -> None:
+        model, names = self.model, (f"{of}_q", f"{of}_qd")
+        inputs = [mask, getattr(model, f"{of}_world"), int(bool(with_q)), int(bool(with_qd))]
+        inputs += [getattr(model, name) for name in names]
+        outputs = [getattr(state, name) for name in names]
+        self._launch(kernel, len(outputs[0]), inputs, outputs)
 
     # --- pieces ----------------------------------------------------------------------------------------------------
 
-    def _launch_begin(self, step: Step) -> tuple[list[wp.array], list[wp.array]]:
+    def _launch_begin(self, step: Step) -> list[wp.array]:
         """Launch everything that is done once in a step.
 
         Returns:
-            Particles and bodies before the step: those of ``state_in``, or copies if the step overwrites them.
+            Particles before the step: those of ``state_in``, or copies if the step overwrites them.
         """
-        model, others, state_in, state_out = self.model, self.others, step.state_in, step.state_out
-        if others.has_particles:
-            _copy(self._kept_particles, [state_out.particle_q, state_out.particle_qd])
+        model, state_in, state_out = self.model, step.state_in, step.state_out
         particles = [state_in.particle_q, state_in.particle_qd]
-        if _overlap(particles, [state_out.particle_q, state_out.particle_qd]):
+        if {array.ptr for array in particles} & {state_out.particle_q.ptr, state_out.particle_qd.ptr}:
             particles = self._particles_before
-        bodies: list[wp.array] = []
         if model.body_count:
-            bodies = [state_in.body_q, state_in.body_qd]
             self._check_bodies(state_in, kernels.BAD_INPUT)
-        if others.has_bodies:
-            _copy(self._kept_bodies, [state_out.body_q, state_out.body_qd])
-            if _overlap(bodies, [state_out.body_q, state_out.body_qd]):
-                _copy(self._bodies_before, bodies)
-                bodies = self._bodies_before
         self.contacts.begin(step, self.report.trouble)
         self._activation = model.tet_activations
         if step.control is not None and step.control.tet_activations is not None:
             self._activation = step.control.tet_activations
         self.tetrahedra.look_at(self._activation)
-        return particles, bodies
-
-    def _bring_back(self, state_in: newton.State, state_out: newton.State) -> None:
-        """Undo a step that was made in place."""
-        particles = [state_in.particle_q, state_in.particle_qd]
-        if _overlap(particles, [state_out.particle_q, state_out.particle_qd]):
-            _copy(particles, self._particles_before)
-        if self.others.has_bodies:
-            bodies = [state_in.body_q, state_in.body_qd]
-            if _overlap(bodies, [state_out.body_q, state_out.body_qd]):
-                _copy(bodies, self._bodies_before)
+        return particles
 
     def _launch_gathering(self, now: newton.State, state_in: newton.State, number: int, copied: bool) -> None:
         """Gather external forces and positions of particles; these are copied if the step begins with them and
@@ -259,46 +229,34 @@ class Steps:
     def _launch_motion(self, substep: Step, fastest: float) -> None:
         model, others = self.model, self.others
         now, out, dt = substep.state_in, substep.state_out, substep.dt
-        if others.has_particles:
-            self._launch(kernels.unpad, model.particle_count, [self._f], [others.particle_forces])
-        else:
-            inputs = [dt, self.damping, model.particle_max_velocity, fastest, self.contacts.particles, self._f]
-            inputs += [now.particle_q, now.particle_qd, *self._motions]
-            outputs = [out.particle_q, out.particle_qd, self.report.trouble]
-            self._launch(kernels.step_particles, model.particle_count, inputs, outputs)
         count = self._steps_of_others(dt)
         part = substep._replace(dt=dt / count)
         for _ in range(count if others.has_bodies or others.has_particles else 0):
             others.step(part, self._body_f if others.has_bodies else now.body_f)
             part = part._replace(state_in=out)
-        if others.has_particles and self.damping > 0:
-            inputs = [dt, self.damping, self.contacts.particles]
-            self._launch(kernels.damp_particles, model.particle_count, inputs, [out.particle_q, out.particle_qd])
+        if others.has_particles:
+            inputs = [dt, self.contacts.particles, now.particle_qd, others.moved[1]]
+            self._launch(kernels.add_changes, model.particle_count, inputs, [self._f])
+        inputs = [dt, self.damping, model.particle_max_velocity, fastest, self.contacts.particles, self._f]
+        inputs += [now.particle_q, now.particle_qd, *self._motions]
+        outputs = [out.particle_q, out.particle_qd, self.report.trouble]
+        self._launch(kernels.step_particles, model.particle_count, inputs, outputs)
         if others.has_bodies:
             self._check_bodies(out, kernels.UNSTABLE)
-        if others.has_particles:
-            inputs = [out.particle_q, out.particle_qd, fastest, model.particle_world, int(kernels.UNSTABLE)]
-            self._launch(OF_PARTICLES.check, model.particle_count, inputs, [self.report.trouble])
 
     def _steps_of_others(self, dt: float) -> int:
         """Number of steps in which everything else makes a substep."""
         return 1
 
     def _check_bodies(self, state: newton.State, wrong: int) -> None:
-        inputs = [state.body_q, state.body_qd, 0.0, self.model.body_world, int(wrong)]
-        self._launch(OF_BODIES.check, self.model.body_count, inputs, [self.report.trouble])
+        inputs = [state.body_q, state.body_qd, self.model.body_world, int(wrong)]
+        self._launch(kernels.check_bodies, self.model.body_count, inputs, [self.report.trouble])
 
-    def _launch_undoing(self, out: newton.State, particles: list[wp.array], bodies: list[wp.array]) -> None:
-        """Restore the worlds with a failure."""
-        if not self.report.may_be_wrong:
-            return
-        model = self.model
-        inputs = [model.particle_world, self.report.trouble, *particles, *self._kept_particles]
-        outputs = [out.particle_q, out.particle_qd]
-        self._launch(OF_PARTICLES.put_back, model.particle_count, inputs, outputs)
-        if self.others.has_bodies:
-            inputs = [model.body_world, self.report.trouble, *bodies, *self._kept_bodies]
-            self._launch(OF_BODIES.put_back, model.body_count, inputs, [out.body_q, out.body_qd])
+    def _launch_undoing(self, out: newton.State, before: list[wp.array]) -> None:
+        """Restore particles in the worlds with a failure."""
+        if self.report.may_be_wrong:
+            inputs = [self.model.particle_world, self.report.trouble, *before, *self._nothing]
+            self._launch(FINISH_PARTICLES, self.model.particle_count, inputs, [out.particle_q, out.particle_qd])
 
     def _launch(self, kernel: wp.Kernel, dim: int, inputs: list, outputs: list) -> None:
         wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)
@@ -327,15 +285,6 @@ class Report:
         """Whether a world may have failed in the present step."""
         # On the CPU a check costs less than a launch; a recorded step must handle all cases.
         return self._device.is_cuda or self._device.is_capturing or bool(self.trouble.numpy().any())
-
-    @property
-    def is_unstable(self) -> bool:
-        """Whether a step's result was not finite; waits for the device."""
-        return bool(self._found.numpy()[kernels.UNSTABLE])
-
-    def forget_unstable(self) -> None:
-        """The step is made again."""
-        self._found[kernels.UNSTABLE : kernels.UNSTABLE + 1].zero_()
 
     def launch(self) -> None:
         """Launch the kernel that stores the failures of a step, at its end."""
@@ -374,22 +323,10 @@ class Report:
         raise UnstableError(self._unstable(where, stable_dt, following))
 
     def _unstable(self, where: str, stable_dt: float | None, following: Following | None) -> str:
-        """The message; from now on steps have more substeps if these follow the state and steps are not repeated."""
+        """The message; from now on steps have more substeps if these follow the state."""
         hint = "" if stable_dt is None else f"; the largest stable step at rest is about {stable_dt:.3g} s"
         wrong = "not finite" if following is None else "not finite or beyond reason"
-        if following is not None and self._device.is_cpu and not following.was_recorded:
-            hint += f"; {2**RETRIES} times the substeps did not help"
-        elif following is not None:
+        if following is not None:
             following.share *= 0.5
             hint += "; from now on steps have twice the substeps, recorded ones when they are recorded again"
         return f"the step's result is {wrong}{where}; that state was not changed{hint}"
-
-
-def _copy(to: list[wp.array], given: list[wp.array]) -> None:
-    for a, b in zip(to, given, strict=True):
-        wp.copy(a, b)
-
-
-def _overlap(a: list[wp.array], b: list[wp.array]) -> bool:
-    """Whether the two lists share an array."""
-    return bool({array.ptr for array in a} & {array.ptr for array in b})

@@ -4,22 +4,17 @@ needs (see ``kernels.stepping.stability``)."""
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, nullcontext
 
 import numpy as np
 import numpy.typing as npt
 import warp as wp
 
 from warp_corot.elasticity import Corotated
-from warp_corot.elasticity.model import isotropic_material
 from warp_corot.errors import InputError
-from warp_corot.kernels.elements.constitutive import IsotropicMaterial, linear_stress
-from warp_corot.kernels.elements.elements import GeneralElements
-from warp_corot.kernels.elements.forces import law_stress, scatter_forces
 from warp_corot.kernels.newton import elements as of_elements
 from warp_corot.kernels.stepping import stability
-from warp_corot.kernels.stepping.stability import add_scaled, scale_by
+from warp_corot.kernels.stepping.stability import add_scaled
 from warp_corot.mesh.topology import linked, node_pairs
 from warp_corot.solvers.pace import Mapped
 from warp_corot.solvers.stability import Curvature, largest_eigenvalue
@@ -53,27 +48,18 @@ class _SmallMotions:
     """
 
     def __init__(self, tets: Tetrahedra, others: Others, a: float, b: float, stiffness: float, damping: float):
-        self.elements, self.others, self._at_particles = tets.elements, others, a * stiffness + b * damping
+        self.tets, self.others, self._scales, self._at_particles = tets, others, (a, b), a * stiffness + b * damping
         mu, lam, viscosity = (array.numpy().astype(np.float64) for array in (tets.mu, tets.lam, tets.k_damp))
         moduli = (a * mu + 0.5 * b * viscosity, a * lam + b * viscosity)
-        device = tets.device
-        self._material = isotropic_material([*(wp.array(m, dtype=wp.float32, device=device) for m in moduli), 1])
-        self._kernel = scatter_forces(GeneralElements, IsotropicMaterial, law_stress(linear_stress))
-        #: Scaled displacements, kept because launches may be recorded.
-        self._parts = [(f, k, wp.zeros_like(tets.u)) for k, f in enumerate((a, b)) if f and others.has_particles]
+        self._moduli = [wp.array(m, dtype=wp.float32, device=tets.device) for m in moduli]
 
     def add_forces(self, u: wp.array, f: wp.array) -> None:
-        count = len(self.elements.volume)
-        wp.launch(self._kernel, dim=count, inputs=[self.elements, self._material, u], outputs=[f], device=u.device)
-        for factor, damping, scaled in self._parts:
-            wp.copy(scaled, u)
-            wp.launch(scale_by, dim=len(u), inputs=[factor, scaled], device=u.device)
-            self.others.add_linear_forces(scaled, f, bool(damping))
+        self.tets.add_linear_forces(u, f, self._moduli)
+        self.others.add_linear_forces(*self._scales, u, f)
         wp.launch(add_scaled, dim=len(u), inputs=[-self._at_particles, u], outputs=[f], device=u.device)
 
-    @contextmanager
-    def state_kept(self) -> Iterator[None]:
-        yield
+    def state_kept(self) -> AbstractContextManager[None]:
+        return nullcontext()
 
 
 def stable_step(
@@ -91,7 +77,7 @@ def stable_step(
         stiffness: Stiffness of a spring at every particle [N/m], for contact.
         damping: Damping of a damper at every particle [N s/m].
         of_bodies: Stiffness over mass at the other end of this spring [1/s^2]; 0: that end does not move. Bodies that
-            are touched in several places need no shorter steps; see ``kernels.newton.explicit_rows``.
+            are touched in several places need no shorter steps; see ``kernels.newton.explicit``.
     """
     inverse = free_inverse_masses(tets.model)
     inverse_mass = wp.array(inverse, dtype=wp.float32, device=tets.device)

@@ -18,7 +18,6 @@ from warp_corot.kernels.elements.constitutive import IsotropicMaterial, linear_s
 from warp_corot.kernels.elements.elements import GeneralElements
 from warp_corot.kernels.elements.forces import law_stress, repair_forces, scatter_forces
 from warp_corot.kernels.elements.general_cuda import BLOCK, PosedElements
-from warp_corot.kernels.math.rotation import quick_rotation
 from warp_corot.kernels.newton.elements import (
     EACH,
     posed_stress,
@@ -30,9 +29,9 @@ from warp_corot.kernels.newton.elements import (
 from warp_corot.kernels.newton.particles import add_nodes, gather_nodes
 from warp_corot.mesh import TetForest
 
-from .checks import LAME, warn_of_lost, why_none
+from .checks import LAME, why_none
 from .library import newton
-from .scene import STATE, attribute_of, mesh_fill, right_handed
+from .scene import STATE, attribute_of, mesh_fill, outward_tets
 
 
 class ForestGroup:
@@ -130,7 +129,7 @@ def _is_there(
     first: npt.NDArray[np.integer],
 ) -> bool:
     """Whether a model's tetrahedra have the forest's nodes, which no others have, and its rest shapes, in any axes."""
-    own = right_handed(forest)
+    own = outward_tets(forest)
     if not ((particles >= 0).all() and (particles + len(forest.points) <= model.particle_count).all()):
         return False
     corners = forest.points[own]
@@ -206,24 +205,15 @@ class Tetrahedra:
         fill = attribute_of(model, "fill")
         self._fill = wp.ones(1, dtype=wp.float32, device=self.device) if fill is None else fill
         self._nothing = {name: wp.empty(0, dtype=dtype, device=self.device) for name, dtype in STATE.items()}
-        #: Materials and inverse masses at the last ``refresh``.
-        self._seen: list[np.ndarray] = [np.empty(0), np.empty(0)]
         self.refresh()
-        warn_of_lost(model, self.tets)
 
-    def refresh(self) -> bool:
+    def refresh(self) -> None:
         """Read the model's current materials.
-
-        Returns:
-            Whether these or the masses have changed since the last call.
 
         Raises:
             InputError: A material is not positive definite, or not finite.
         """
-        present = [array.numpy().copy() for array in (self.model.tet_materials, self.model.particle_inv_mass)]
-        if all(np.array_equal(a, b) for a, b in zip(present, self._seen, strict=True)):
-            return False
-        materials = present[0].reshape(-1, 3).astype(np.float64)
+        materials = self.model.tet_materials.numpy().reshape(-1, 3).astype(np.float64)
         a, b = LAME[self.lame]
         mu, lam = a * materials[:, 0], materials[:, 1] + b * materials[:, 0]
         bad = np.flatnonzero(~(np.isfinite(materials).all(axis=1) & (mu > 0) & (3 * lam + 2 * mu > 0)))
@@ -245,8 +235,6 @@ class Tetrahedra:
         self.damped = bool((materials[:, 2] > 0).any())
         for group in self.groups:
             group.set_material(mu, lam)
-        self._seen = present
-        return True
 
     def look_at(self, activation: wp.array) -> None:
         """Check, at the beginning of a step, whether elements may be active."""
@@ -267,10 +255,11 @@ class Tetrahedra:
         """Add the elastic forces of displacements [N] to f, both vec4 [P]."""
         self._add_forces(u, self._no_activation, self._no_velocities, f)
 
-    def add_linear_forces(self, u: wp.array, f: wp.array) -> None:
-        """Add the elastic forces of small displacements from rest shapes [N] to f, vec4 [P]."""
+    def add_linear_forces(self, u: wp.array, f: wp.array, moduli: list[wp.array] | None = None) -> None:
+        """Add the elastic forces of small displacements from rest shapes [N] to f, vec4 [P], with these mu and lambda
+        [Pa] or the model's."""
         kernel = scatter_forces(GeneralElements, IsotropicMaterial, law_stress(linear_stress))
-        material = isotropic_material([self.mu, self.lam, 1])
+        material = isotropic_material([*(moduli or [self.mu, self.lam]), 1])
         self._launch(kernel, self.model.tet_count, [self.elements, material, u], [f])
 
     def write_attributes(self, state: newton.State) -> None:
@@ -296,7 +285,7 @@ class Tetrahedra:
         """Add elastic forces, and others in the same kernel."""
         if self._fused and self.single_count:
             inputs = [self._single, *self._single_materials, self._single_ids, activation, u, v]
-            self._launch(scatter_posed(quick_rotation, self.damped), self.single_count, inputs, [f], BLOCK)
+            self._launch(scatter_posed(self.damped), self.single_count, inputs, [f], BLOCK)
         elif self.single_count:
             self._lanes.scatter_forces(self._single_isotropic(*self._single_materials[:2]), u, f)
         for group in self.groups:

@@ -19,6 +19,7 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from warp_corot.errors import InputError
+from warp_corot.inputs.checks import checked_vector
 from warp_corot.inputs.selection import select_nodes
 from warp_corot.io.files.quiet import quietly
 from warp_corot.io.files.usd import first_message
@@ -90,8 +91,8 @@ class StageOptions:
         Isotropic(_first(young, 1.0), _first(poisson, POISSON), _first(density, DENSITY))
         if self.viscosity is not None and not (math.isfinite(self.viscosity) and self.viscosity >= 0):
             raise InputError(f"viscosity is {self.viscosity:g}; it must be zero or a positive time in seconds")
-        if self.gravity is not None and not (np.shape(self.gravity) == (3,) and np.isfinite(self.gravity).all()):
-            raise InputError(f"gravity is {self.gravity}; it must be three finite numbers [m/s^2]")
+        if self.gravity is not None:
+            checked_vector(self.gravity, "gravity", "m/s^2")
         if not (math.isfinite(self.radius) and self.radius >= 0):
             raise InputError(f"radius is {self.radius:g}; it must be zero or a positive length in metres")
 
@@ -182,17 +183,22 @@ def stage_model(scene: Scene, options: StageOptions, device: Any = None) -> Stag
     held = _hold(made, builder, found, options)
     _stand(made, builder, options, held)
     made.notes += notes_of(made, builder, options)
-    _set_contacts(made, builder)
+    stiffness, damping = (value / units.kilograms for value in contact_law(made.soft))
+    _set_colliders(builder, stiffness, damping)
     register_custom_attributes(builder)
     check_colliders(builder, scene.path)
     try:
         made.model = model = builder.finalize(device=device)
     except (RuntimeError, ValueError) as error:
         raise InputError(f"{scene.path}: {error}") from None
-    stiffness, damping = contact_law(made.soft)
-    model.soft_contact_ke, model.soft_contact_kd = stiffness / units.kilograms, damping / units.kilograms
+    model.soft_contact_ke, model.soft_contact_kd = stiffness, damping
     model.soft_contact_kf /= units.kilograms
-    _set_friction(made)
+    # Newton has one number for soft bodies, averaged with a shape's.
+    given = [said["friction"] for body in made.soft if "friction" in (said := scene.says(body.prim.path))]
+    if given:
+        model.soft_contact_mu = sum(given) / len(given)
+    if given and (len(set(given)) > 1 or len(given) < len(made.soft)):
+        made.notes.append(f"soft bodies have one friction, the mean of those given: {model.soft_contact_mu:.3g}")
     model.particle_max_velocity /= units.metres
     made.margin = max(body.edge for body in made.soft) / units.metres
     _find_surfaces(made, found)
@@ -204,7 +210,8 @@ def stage_model(scene: Scene, options: StageOptions, device: Any = None) -> Stag
 def _builder(scene: Scene, options: StageOptions) -> newton.ModelBuilder:
     """A builder with its defaults in the stage's units, and marks for materials that the stage does not give."""
     metres, kilograms = scene.units
-    builder = newton.ModelBuilder(up_axis=scene.up_axis, gravity=_down(scene.up_axis, GRAVITY / metres))
+    x, y, z = (-GRAVITY / metres * (name == scene.up_axis) for name in "XYZ")
+    builder = newton.ModelBuilder(up_axis=scene.up_axis, gravity=(x, y, z))
     builder.default_particle_radius = options.radius / metres
     builder.default_tet_k_mu = builder.default_tet_k_lambda = builder.default_tet_density = math.nan
     builder.rigid_gap /= metres
@@ -212,11 +219,6 @@ def _builder(scene: Scene, options: StageOptions) -> newton.ModelBuilder:
     shape.density /= scene.units.density
     shape.ke, shape.kd, shape.kf = (value / kilograms for value in (shape.ke, shape.kd, shape.kf))
     return builder
-
-
-def _down(axis: str, amount: float) -> tuple[float, float, float]:
-    x, y, z = (-amount if name == axis else 0.0 for name in "XYZ")
-    return x, y, z
 
 
 def _add_usd(builder: newton.ModelBuilder, scene: Scene) -> dict[str, Any]:
@@ -280,18 +282,18 @@ def _hold(made: StageModel, builder: newton.ModelBuilder, found: dict[str, Any],
             particle = builder.attachment_particle_body_particle[index]
             body = next(b for b in made.soft if b.particles.start <= particle < b.particles.stop)
             builder.attachment_particle_body_stiffness[index] = body.young * body.edge / made.scene.units.kilograms
-    if options.fix is not None:
-        chosen: set[int] = set()
-        for body in made.soft:
-            points = np.array(builder.particle_q[body.particles], dtype=np.float64) * made.scene.units.metres
-            chosen |= set((np.flatnonzero(select_nodes(options.fix, points)) + body.particles.start).tolist())
-        if not chosen:
-            made.notes.append(f"no point is held by {options.fix!r}; coordinates are world ones in metres (--fix)")
-        held |= chosen
-    else:
-        for body in made.soft:
-            said = made.scene.held(body.prim.path)
-            held |= set((said[said < len(body.prim.points)] + body.particles.start).tolist())
+    chosen: set[int] = set()
+    for body in made.soft:
+        points = np.array(builder.particle_q[body.particles], dtype=np.float64) * made.scene.units.metres
+        said = (
+            made.scene.held(body.prim.path)
+            if options.fix is None
+            else np.flatnonzero(select_nodes(options.fix, points))
+        )
+        chosen |= set((said[said < len(body.prim.points)] + body.particles.start).tolist())
+    if options.fix is not None and not chosen:
+        made.notes.append(f"no point is held by {options.fix!r}; coordinates are world ones in metres (--fix)")
+    held |= chosen
     for particle in held:
         builder.particle_mass[particle] = 0.0
     if held:
@@ -304,7 +306,10 @@ def _hold(made: StageModel, builder: newton.ModelBuilder, found: dict[str, Any],
 def _stand(made: StageModel, builder: newton.ModelBuilder, options: StageOptions, held: int) -> None:
     """Add a ground plane if requested."""
     ground = options.ground
-    stands = bool(held) or _something_stays(builder)
+    # A collider does not fall if it has no body, a kinematic one, or one jointed to such a body.
+    collides, still = int(newton.ShapeFlags.COLLIDE_SHAPES | newton.ShapeFlags.COLLIDE_PARTICLES), staying(builder)
+    shapes = zip(builder.shape_body, builder.shape_flags, strict=True)
+    stands = bool(held) or any(body in still and flags & collides for body, flags in shapes)
     if ground == "none" or (ground == "auto" and stands):
         if not stands:
             made.notes.append("nothing holds the bodies: they fall freely")
@@ -329,35 +334,13 @@ def _stand(made: StageModel, builder: newton.ModelBuilder, options: StageOptions
     made.ground = corners
 
 
-def _something_stays(builder: newton.ModelBuilder) -> bool:
-    """Whether a collider does not fall: it has no body, a kinematic one, or one jointed to such a body."""
-    collides = int(newton.ShapeFlags.COLLIDE_SHAPES) | int(newton.ShapeFlags.COLLIDE_PARTICLES)
-    still = staying(builder)
-    shapes = zip(builder.shape_body, builder.shape_flags, strict=True)
-    return any(body in still and flags & collides for body, flags in shapes)
-
-
-def _set_contacts(made: StageModel, builder: newton.ModelBuilder) -> None:
+def _set_colliders(builder: newton.ModelBuilder, stiffness: float, damping: float) -> None:
     """If no rigid body moves, make colliders without a stiffness of their own as stiff as the soft bodies."""
-    if builder.body_count:
-        return
-    stiffness, damping = (value / made.scene.units.kilograms for value in contact_law(made.soft))
-    default = builder.default_shape_cfg
-    for shape in range(builder.shape_count):
-        if builder.shape_material_ke[shape] == default.ke:
-            builder.shape_material_ke[shape] = stiffness
-        if builder.shape_material_kd[shape] == default.kd:
-            builder.shape_material_kd[shape] = damping
-
-
-def _set_friction(made: StageModel) -> None:
-    """Set the friction of the soft bodies from the stage: one number in Newton, averaged with a shape's."""
-    said = [made.scene.says(body.prim.path) for body in made.soft]
-    given = [one["friction"] for one in said if "friction" in one]
-    if given:
-        made.model.soft_contact_mu = sum(given) / len(given)
-    if given and (len(set(given)) > 1 or len(given) < len(said)):
-        made.notes.append(f"soft bodies have one friction, the mean of those given: {made.model.soft_contact_mu:.3g}")
+    for values, default, value in (
+        (builder.shape_material_ke, builder.default_shape_cfg.ke, stiffness),
+        (builder.shape_material_kd, builder.default_shape_cfg.kd, damping),
+    ):
+        values[:] = [value if own == default and not builder.body_count else own for own in values]
 
 
 def _find_surfaces(made: StageModel, found: dict[str, Any]) -> None:
@@ -413,7 +396,8 @@ def give_material(
     if "density" not in said:
         density = _first(options.density, DENSITY)
         # A body's masses exist already, with a default; those of other tetrahedra do not.
-        masses = _lumped(tets, volumes, len(x)) if np.isnan(masses).any() else masses / (masses.sum() / volumes.sum())
+        lumped = np.bincount(tets.ravel(), np.repeat(volumes / 4.0, 4), minlength=len(x)).astype(np.float64)
+        masses = lumped if np.isnan(masses).any() else masses / (masses.sum() / volumes.sum())
         masses *= density / units.density
         builder.particle_mass[body.particles] = masses.tolist()
         chosen.append(("density", f"density {density:g} kg/m^3"))
@@ -451,11 +435,6 @@ def give_material(
         return None
     missing = "no physics material for a volume" if not body.given else "a physics material with missing values"
     return f"{path} has {missing}: {', '.join(text for _, text in chosen)} ({', '.join(f'--{n}' for n, _ in chosen)})"
-
-
-def _lumped(tets: npt.NDArray[np.integer], volumes: npt.NDArray[np.float64], count: int) -> npt.NDArray[np.float64]:
-    """A quarter of each tetrahedron's volume at each of its corners, float64 [count]."""
-    return np.bincount(tets.ravel(), np.repeat(volumes / 4.0, 4), minlength=count).astype(np.float64)
 
 
 def _first(given: float | None, default: float) -> float:
@@ -544,8 +523,12 @@ def warn_of_overlaps(made: StageModel, contacts: newton.Contacts) -> None:
     fields = (contacts.soft_contact_particle, contacts.soft_contact_shape, contacts.soft_contact_body_pos)
     particle, shape, point = (array.numpy()[:count] for array in fields)
     normal = contacts.soft_contact_normal.numpy()[:count].astype(np.float64)
-    x = model.particle_q.numpy().astype(np.float64)[particle]
-    gap = np.einsum("ci,ci->c", normal, x - _in_world(model, shape, point)) - model.particle_radius.numpy()[particle]
+    x, point = model.particle_q.numpy().astype(np.float64)[particle], point.astype(np.float64)
+    owner = model.shape_body.numpy()[shape]
+    if (moving := owner >= 0).any():
+        pose = model.body_q.numpy().astype(np.float64)[owner[moving]]
+        point[moving] = Rotation.from_quat(pose[:, 3:]).apply(point[moving]) + pose[:, :3]
+    gap = np.einsum("ci,ci->c", normal, x - point) - model.particle_radius.numpy()[particle]
     gap[model.particle_inv_mass.numpy()[particle] == 0.0] = np.inf
     for body in made.soft:
         inside = (particle >= body.particles.start) & (particle < body.particles.stop)
@@ -583,15 +566,10 @@ def notes_of(made: StageModel, builder: newton.ModelBuilder, options: StageOptio
             yield f"--{name} is not used: the stage gives it for all soft bodies"
     if len(made.soft) > 1 and not options.soft_contact:
         yield "soft bodies touch colliders and rigid bodies, not one another"
-    yield from _narrow(made, builder, options.radius)
-
-
-def _narrow(made: StageModel, builder: newton.ModelBuilder, radius: float) -> Iterator[str]:
-    """Rigid bodies that can slip in between the points of a soft body."""
+    body = max(made.soft, key=lambda one: one.edge)
     for path, bounds in _falling(made, builder):
-        width = float(np.sort(bounds[1] - bounds[0])[1]) * made.scene.units.metres
-        body = max(made.soft, key=lambda one: one.edge)
-        if width < body.edge and body.edge > 2.0 * radius:
+        width = float(np.sort(bounds[1] - bounds[0])[1]) * scene.units.metres
+        if width < body.edge and body.edge > 2.0 * options.radius:
             yield (
                 f"{path} is {width:.3g} m wide and can slip in between the points of {body.prim.path}, {body.edge:.3g} "
                 "m apart, because contact is only at points; a finer mesh or points with a radius help (--radius)"
@@ -620,15 +598,6 @@ def _falling(made: StageModel, builder: newton.ModelBuilder) -> Iterator[tuple[s
         bounds = None if index in held else made.scene.bounds(path)
         if bounds is not None:
             yield path, bounds
-
-
-def _in_world(model: Any, shape: npt.NDArray[np.integer], point: npt.NDArray[np.float32]) -> npt.NDArray[np.float64]:
-    """Points given in the frames of the shapes' bodies, in the world, float64 [C, 3]."""
-    found, body = point.astype(np.float64), model.shape_body.numpy()[shape]
-    if (moving := body >= 0).any():
-        pose = model.body_q.numpy().astype(np.float64)[body[moving]]
-        found[moving] = Rotation.from_quat(pose[:, 3:]).apply(found[moving]) + pose[:, :3]
-    return found
 
 
 def _names(paths: list[str]) -> str:

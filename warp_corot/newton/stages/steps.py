@@ -123,7 +123,10 @@ class StageSimulation:
         self._shown = model.state()
         self._shown.particle_q = self.state.particle_q
         self._visuals = newton.geometry.DeformableVisuals(model) if self.parts.surface_points else None
-        self._load_kernels()
+        # A step of a copy of the state: loading kernels within a recording would end it on some drivers.
+        self.dt = min(self._longest_step(), 1e-6)
+        self._step(self._new_state())
+        self.solver.check()
         self._record_steps()
         self.time = 0.0
         self.frames = 0
@@ -141,7 +144,10 @@ class StageSimulation:
             for _ in range(self.steps // self._chunk):
                 wp.capture_launch(self._graph)
             try:
-                self._check()
+                with warnings.catch_warnings():
+                    # The next frame has the steps that this one lacked.
+                    warnings.filterwarnings("ignore", "a recorded step has too few substeps")
+                    self.solver.check()
                 break
             except InputError as error:
                 raise UnstableError(f"after {self.time:.3g} s: {error}") from None
@@ -255,13 +261,10 @@ class StageSimulation:
         if count != self.steps:
             self.steps = count
             self.dt = 1.0 / (self.fps * count)
-            self._graph = self._recorded()
-
-    def _check(self) -> None:
-        with warnings.catch_warnings():
-            # The next frame has the steps that this one lacked.
-            warnings.filterwarnings("ignore", "a recorded step has too few substeps")
-            self.solver.check()
+            with wp.ScopedCapture(device=self.parts.model.device) as capture:
+                for _ in range(self._chunk):
+                    self._step(self.state)
+            self._graph = capture.graph
 
     def _new_state(self) -> newton.State:
         state = self.parts.model.state()
@@ -272,16 +275,3 @@ class StageSimulation:
         state.clear_forces()
         self._pipeline.collide(state, self._contacts, soft_self_contact=self._touch)
         self.solver.step(state, state, None, self._contacts, self.dt)
-
-    def _load_kernels(self) -> None:
-        """Step a copy of the state: loading kernels within a recording would end it on some drivers."""
-        self.dt = min(self._longest_step(), 1e-6)
-        self._step(self._new_state())
-        self.solver.check()
-
-    def _recorded(self) -> Any:
-        """The steps of a chunk, as a graph."""
-        with wp.ScopedCapture(device=self.parts.model.device) as capture:
-            for _ in range(self._chunk):
-                self._step(self.state)
-        return capture.graph

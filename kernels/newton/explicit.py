@@ -1,4 +1,4 @@
-"""Forces of rows in explicit steps.
+"""Forces of rows in explicit steps, and rows of soft surfaces with one another, which only explicit steps have.
 
 Forces on particles and bodies are opposite, so momentum is exchanged exactly. Damping and friction do not reverse a
 relative velocity within a step, however light particle and body are: the part of the law that would do so is left out.
@@ -17,23 +17,37 @@ spring still connects a particle and the body, only shorter. V' is an energy, so
 M^-1 times its curvature is below 1/dt^2 for any number and stiffness of springs; without stiff springs, d vanishes. At
 rest springs carry the same forces, with the body deeper by g dt^2. V is quadratic except for the set of closed
 contacts, so Newton's method finds d.
+
+Contact of soft surfaces with one another: vertices with triangles and edges with edges, as Newton's detector lists
+them.
+
+A vertex at the distance d from a triangle has the energy k (margin - d)^2 / 2 while d < margin. It is a function of
+positions only, and so adds no energy. Edges that are closest at their ends repeat this: their force is multiplied by a
+measure from 0 there to 1 in the middle. Surfaces of tetrahedra have an inside: there d becomes negative if the vertex
+or edge belongs to another body, so that what has sunk in is pushed out. Cloth has two sides. Loads are those of
+``rows``; a pair counts twice, because its two sides may move against one another. What is closer at
+first than the margin has this distance as its margin, so that nothing starts with a push: between bodies no less than
+a fraction of the margin, to keep cloth apart.
 """
 
 import warp as wp
 
+from warp_corot.kernels.contact.closest import on_triangle
 from warp_corot.kernels.contact.law import held_back
 from warp_corot.kernels.contact.vertices import across
 from warp_corot.kernels.implicit.assembled import root_columns
 
-from .particles import Bodies, Particles, is_fixed
+from .particles import TOO_MANY_PAIRS, Bodies, Particles, is_fixed, mark
 from .rows import (
     ContactLaw,
     Row,
+    add_load,
     add_to_particles,
     ease_off,
     gap_of,
     inverse_mass_of,
     is_attachment,
+    no_row,
     point_and_arm,
     pull_of,
     share_of,
@@ -289,3 +303,225 @@ def solve_yielding(
             e[i] -= a[i, column] * e[column]
         e[i] /= a[i, i]
     bodies.yielding[b] = factor * e
+
+
+# --- soft surfaces with one another ----------------------------------------------------------------------------------
+
+#: A distance below which a direction is rounding [m].
+COINCIDENT = wp.constant(1.0e-9)
+#: Least margin between bodies, over the margin.
+LEAST = wp.constant(0.25)
+#: Weights of closest points inside a triangle are above this.
+INSIDE = wp.constant(1.0e-6)
+
+
+@wp.struct
+class Surfaces:
+    """Triangles and edges of a model."""
+
+    triangles: wp.array2d[wp.int32]
+    edges: wp.array2d[wp.int32]  # opposite vertices, then the edge's
+    facing: wp.array[wp.float32]  # of each triangle: 1 if its normal points out of tetrahedra, -1 into them, 0 of cloth
+    outward: wp.array[wp.vec2i]  # of each edge: its triangles on tetrahedra, or -1
+    part: wp.array[wp.int32]  # of each particle: its connected body, or -1 if it is on no triangle
+    rest: wp.array[wp.vec3]  # positions at first [m]
+
+
+@wp.struct
+class PairLists:
+    """Newton's lists of pairs, with its names: a row for each vertex and for each edge."""
+
+    margin: float  # distance at which surfaces begin to push one another [m]
+    parallel: float  # sine of an angle below which two edges are parallel
+    # Of each pair the vertex and the triangle, or both edges.
+    vertex_colliding_triangles: wp.array[wp.int32]
+    vertex_colliding_triangles_offsets: wp.array[wp.int32]
+    vertex_colliding_triangles_count: wp.array[wp.int32]
+    edge_colliding_edges: wp.array[wp.int32]
+    edge_colliding_edges_offsets: wp.array[wp.int32]
+    edge_colliding_edges_count: wp.array[wp.int32]
+
+
+@wp.func
+def outward_normal(surfaces: Surfaces, t: int, q: wp.array[wp.vec3]):
+    """Normal of a triangle of tetrahedra, times twice its area."""
+    a = q[surfaces.triangles[t, 0]]
+    n = wp.cross(q[surfaces.triangles[t, 1]] - a, q[surfaces.triangles[t, 2]] - a)
+    return surfaces.facing[t] * n
+
+
+@wp.func
+def margin_of(surfaces: Surfaces, i: int, j: int, margin: float, first: float):
+    """The margin of a pair, with one particle of each side and the distance at first [m]."""
+    least = float(0.0)
+    if surfaces.part[i] != surfaces.part[j]:
+        least = LEAST * margin
+    return wp.min(margin, wp.max(first, least))
+
+
+@wp.func
+def vertex_row(surfaces: Surfaces, v: int, t: int, margin: float, q: wp.array[wp.vec3]):
+    """A vertex and a triangle."""
+    row = no_row()
+    i = surfaces.triangles[t, 0]
+    j = surfaces.triangles[t, 1]
+    k = surfaces.triangles[t, 2]
+    if surfaces.part[v] < 0:
+        return row
+    w = on_triangle(q[v], q[i], q[j], q[k])
+    apart = q[v] - (w[0] * q[i] + w[1] * q[j] + w[2] * q[k])
+    distance = wp.length(apart)
+    out = outward_normal(surfaces, t, q)
+    sunk = bool(False)
+    if surfaces.facing[t] != 0.0 and surfaces.part[v] != surfaces.part[i]:
+        sunk = wp.dot(apart, out) < 0.0
+        if sunk and wp.min(w) < INSIDE:
+            # Beside the triangle: another one faces the vertex.
+            return row
+    row.measure = 1.0
+    row.nodes = wp.vec4i(v, i, j, k)
+    row.weights = wp.vec4(1.0, -w[0], -w[1], -w[2])
+    x = surfaces.rest
+    w = on_triangle(x[v], x[i], x[j], x[k])
+    first = wp.length(x[v] - w[0] * x[i] - w[1] * x[j] - w[2] * x[k])
+    row.offset = margin_of(surfaces, v, i, margin, first)
+    row.normal = wp.normalize(out)
+    if distance > COINCIDENT:
+        row.normal = apart / distance
+    if sunk:
+        row.normal = -row.normal
+    return row
+
+
+@wp.func
+def points_out(surfaces: Surfaces, e: int, direction: wp.vec3, q: wp.array[wp.vec3]):
+    """1 or -1 if a direction points out of or into the tetrahedra at an edge; 0 if there are none."""
+    sum = wp.vec3()
+    for side in range(2):
+        t = surfaces.outward[e][side]
+        if t >= 0:
+            sum += wp.normalize(outward_normal(surfaces, t, q))
+    return wp.sign(wp.dot(sum, direction)) * wp.where(wp.length_sq(sum) > 0.0, 1.0, 0.0)
+
+
+@wp.func
+def edge_row(surfaces: Surfaces, e: int, other: int, margin: float, parallel: float, q: wp.array[wp.vec3]):
+    """Two edges."""
+    row = no_row()
+    i = surfaces.edges[e, 2]
+    j = surfaces.edges[e, 3]
+    k = surfaces.edges[other, 2]
+    m = surfaces.edges[other, 3]
+    found = wp.closest_point_edge_edge(q[i], q[j], q[k], q[m], parallel)
+    s = found[0]
+    t = found[1]
+    apart = q[i] + s * (q[j] - q[i]) - q[k] - t * (q[m] - q[k])
+    distance = wp.length(apart)
+    if distance < COINCIDENT:
+        return row
+    row.measure = 16.0 * s * (1.0 - s) * t * (1.0 - t)
+    row.nodes = wp.vec4i(i, j, k, m)
+    row.weights = wp.vec4(1.0 - s, s, t - 1.0, -t)
+    row.normal = apart / distance
+    if surfaces.part[i] != surfaces.part[k]:
+        one = points_out(surfaces, e, -row.normal, q)
+        two = points_out(surfaces, other, row.normal, q)
+        if one + two < 0.0 and one <= 0.0 and two <= 0.0:
+            row.normal = -row.normal
+    x = surfaces.rest
+    first = wp.closest_point_edge_edge(x[i], x[j], x[k], x[m], parallel)[2]
+    row.offset = margin_of(surfaces, i, k, margin, first)
+    return row
+
+
+@wp.func
+def row_size(starts: wp.array[wp.int32], counts: wp.array[wp.int32], n: int):
+    """Number of pairs that row n of a list holds, no more than fit, and whether more were found."""
+    if n >= counts.shape[0]:
+        return 0, False
+    room = starts[n + 1] - starts[n]
+    return wp.min(counts[n], room), counts[n] > room
+
+
+@wp.func
+def row_sizes(lists: PairLists, n: int):
+    """The same of vertex n and of edge n."""
+    in_triangles, lacks = row_size(lists.vertex_colliding_triangles_offsets, lists.vertex_colliding_triangles_count, n)
+    in_edges, lacks_edges = row_size(lists.edge_colliding_edges_offsets, lists.edge_colliding_edges_count, n)
+    return in_triangles, lacks, in_edges, lacks_edges
+
+
+@wp.func
+def listed_row(surfaces: Surfaces, lists: PairLists, law: ContactLaw, n: int, c: int, q: wp.array[wp.vec3]):
+    """The c-th pair in the rows of vertex n and edge n, if it touches, and its gap. Two edges are listed twice."""
+    in_triangles, _lacks, _in_edges, _lacks_edges = row_sizes(lists, n)
+    row = no_row()
+    if c < in_triangles:
+        t = lists.vertex_colliding_triangles[2 * (lists.vertex_colliding_triangles_offsets[n] + c) + 1]
+        row = vertex_row(surfaces, n, t, lists.margin, q)
+    else:
+        other = lists.edge_colliding_edges[2 * (lists.edge_colliding_edges_offsets[n] + c - in_triangles) + 1]
+        if n < other:
+            row = edge_row(surfaces, n, other, lists.margin, lists.parallel, q)
+    gap = float(1.0)
+    if row.nodes[0] >= 0:
+        gap = gap_of(row, sum_of(row, q))
+    row.counted = 2.0 * row.measure
+    row.stiffness = law.stiffness
+    row.damping = law.damping
+    row.slope = law.slope
+    row.friction = law.friction
+    return row, gap
+
+
+@wp.kernel(enable_backward=False)
+def count_pair_loads(
+    # In
+    surfaces: Surfaces,
+    lists: PairLists,
+    law: ContactLaw,
+    q: wp.array[wp.vec3],
+    # In and out
+    load: wp.array[wp.float32],
+):
+    """Add twice the weights of all pairs that touch."""
+    n = wp.tid()
+    in_triangles, _lacks, in_edges, _lacks_edges = row_sizes(lists, n)
+    for c in range(in_triangles + in_edges):
+        row, gap = listed_row(surfaces, lists, law, n, c, q)
+        if gap < 0.0:
+            add_load(row, load)
+
+
+@wp.kernel(enable_backward=False)
+def scatter_pairs(
+    # In
+    surfaces: Surfaces,
+    lists: PairLists,
+    law: ContactLaw,
+    dt: float,
+    load: wp.array[wp.float32],
+    particles: Particles,
+    q: wp.array[wp.vec3],
+    qd: wp.array[wp.vec3],
+    before: wp.array[wp.vec4],
+    # Out
+    f: wp.array[wp.vec4],
+    trouble: wp.array[wp.int32],
+):
+    """Forces of all pairs. A row that holds fewer pairs than were found marks the world."""
+    n = wp.tid()
+    in_triangles, lacks, in_edges, lacks_edges = row_sizes(lists, n)
+    if lacks:
+        mark(n, TOO_MANY_PAIRS, particles, trouble)
+    if lacks_edges:
+        mark(surfaces.edges[n, 2], TOO_MANY_PAIRS, particles, trouble)
+    for c in range(in_triangles + in_edges):
+        row, gap = listed_row(surfaces, lists, law, n, c, q)
+        if gap < 0.0:
+            m = Mobility()
+            m.particle = inverse_mass_of(row, load, particles)
+            share = share_of(row, load, law.crowd)
+            pull = pull_of(row, dt, particles, before)
+            force = contact_force(row, gap, 0.0, sum_of(row, qd), pull, m, share, dt)
+            add_to_particles(row, force, f)
