@@ -15,7 +15,7 @@ from warp_corot.cutting.blade import Blade
 from warp_corot.elasticity import Corotated
 from warp_corot.errors import InputError, UnstableError
 from warp_corot.inputs import loading
-from warp_corot.inputs.device import checked_device
+from warp_corot.inputs.checks import checked_device
 from warp_corot.inputs.stopwatch import WATCH
 from warp_corot.mesh import TetForest
 from warp_corot.simulation.resting import bring_to_rest

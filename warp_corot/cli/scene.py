@@ -11,7 +11,7 @@ import numpy as np
 
 from warp_corot.domain.units import length, pressure
 from warp_corot.errors import InputError, UnstableError
-from warp_corot.inputs.device import checked_device
+from warp_corot.inputs.checks import checked_device
 from warp_corot.inputs.stopwatch import WATCH
 
 from .simulate import aligned, milliseconds, speed, unfinished, wall_time

@@ -222,7 +222,7 @@ def tell_compiling(device: wp.Device) -> None:
 
 def begin_compiling(device: str | None) -> None:
     """Begin to load what all runs launch, while Python imports the rest; that a device is not there is said later."""
-    from warp_corot.inputs.device import checked_device
+    from warp_corot.inputs.checks import checked_device
     from warp_corot.inputs.loading import BODY, begin_loading
 
     _listen()
