@@ -1,5 +1,5 @@
 // Laws and mean dilatations of single elements, with their differentials: in float64 on the host (elements/float64.py), in
-// float32 on every device (elements/single.py).
+// float32 on every device (elements/constitutive.py, elements/forces.py, elements/dilatation.py).
 #pragma once
 
 #include "added.h"
