@@ -124,23 +124,25 @@ def triangle_pressures(
 
 
 @wp.kernel(enable_backward=False)
-def describe_touches(
+def measure_gaps(
     # In
     shapes: Shapes,
-    motions: Motions,
-    surface: Surface,
-    forces: wp.array2d[wp.vec3],
+    poses: wp.array2d[wp.transform],
+    obstacles: wp.array[wp.int32],
+    worlds: wp.array[wp.int32],
+    points: wp.array2d[wp.vec3],
+    most: float,
     # Out
     gaps: wp.array2d[wp.float32],
     normals: wp.array2d[wp.vec3],
 ):
-    """Find the gap and the normal of the nodes that obstacles push, at the beginning of the last step."""
-    o, s = wp.tid()
-    force = forces[o, s]
-    if wp.dot(force, force) > 0.0:
-        gap, n = distance_to(shapes, o, motions.now[surface.world[s], o], surface.x[s], 1.0)
-        gaps[o, s] = gap
-        normals[o, s] = n
+    """Find distances [n, k] of points from an obstacle in a world for each n [m], negative inside, and the directions
+    out of it. Distances beyond ``most`` are only known to be larger than it.
+    """
+    i, k = wp.tid()
+    gap, normal = distance_to(shapes, obstacles[i], poses[worlds[i], obstacles[i]], points[i, k], most)
+    gaps[i, k] = gap
+    normals[i, k] = normal
 
 
 @wp.kernel(enable_backward=False)
@@ -217,22 +219,3 @@ def place_forces(grain: float, totals: wp.array2d[wp.vec3], forces: wp.array[wp.
     for o in range(totals.shape[0]):
         force += totals[o, s]
     surface.f[s] = force
-
-
-@wp.kernel(enable_backward=False)
-def find_gaps(
-    # In
-    shapes: Shapes,
-    motions: Motions,
-    world: int,
-    points: wp.array[wp.vec3],
-    most: float,
-    # Out
-    gaps: wp.array2d[wp.float32],
-):
-    """Find distances [O, n] of points from the obstacles of a world [m], negative inside. Distances beyond
-    ``most`` are only known to be larger than it.
-    """
-    o, i = wp.tid()
-    gap, _normal = distance_to(shapes, o, motions.later[world, o], points[i], most)
-    gaps[o, i] = gap

@@ -5,8 +5,6 @@ A row is a contact: its normal times the share of each node that carries it. N h
 
 import warp as wp
 
-from warp_corot.kernels.contact.motion import Motions
-from warp_corot.kernels.contact.shapes import Shapes, distance_to
 from warp_corot.kernels.elements.elements import load_node, store_node
 
 wp.set_module_options({"enable_backward": False})
@@ -37,23 +35,6 @@ class Rows:
     block_starts: wp.array[wp.int32]
     block_nodes: wp.array[wp.int32]
     blocks: wp.array[wp.mat33]
-
-
-@wp.kernel(enable_backward=False)
-def find_normals(
-    # In
-    shapes: Shapes,
-    motions: Motions,
-    obstacle: wp.array[wp.int32],
-    world: wp.array[wp.int32],
-    points: wp.array2d[wp.vec3],
-    # Out
-    normals: wp.array2d[wp.vec3],
-):
-    i, k = wp.tid()
-    o = obstacle[i]
-    _gap, normal = distance_to(shapes, o, motions.later[world[i], o], points[i, k], 1.0)
-    normals[i, k] = normal
 
 
 @wp.kernel(enable_backward=False)

@@ -13,7 +13,7 @@ from warp_corot.kernels.contact import motion as kernels
 from warp_corot.kernels.contact import sums, touches
 from warp_corot.kernels.contact.law import Law
 from warp_corot.kernels.contact.shapes import Shapes
-from warp_corot.kernels.contact.sums import find_gaps
+from warp_corot.kernels.contact.sums import measure_gaps
 from warp_corot.kernels.contact.vertices import Rigid
 from warp_corot.kernels.contact.watch import Watch, move_obstacles
 from warp_corot.solvers.system import System
@@ -197,10 +197,9 @@ class Obstacles:
     def gaps(self, points: npt.NDArray[np.float64], most: float, world: int = 0) -> npt.NDArray[np.float32]:
         """Distances of points [m], [n, 3], from the obstacles of one world [m], negative inside, [O, n]; only
         those of less than ``most`` are exact. Waits for the device."""
-        found = wp.zeros((self.count, len(points)), dtype=wp.float32, device=self.device)
-        asked = wp.array(points, dtype=wp.vec3, device=self.device)
-        wp.launch(find_gaps, found.shape, [self.shapes, self.motions, world, asked, most], [found], device=self.device)
-        return found.numpy()
+        numbers = np.arange(self.count)
+        everywhere = np.broadcast_to(points, (self.count, *points.shape))
+        return measured_gaps(self.shapes, self.motions.later, numbers, np.full(self.count, world), everywhere, most)[0]
 
     def poses(self) -> npt.NDArray[np.float64]:
         """Their poses, float64 [worlds, O, 7]; waits for the device."""
@@ -245,6 +244,30 @@ class Obstacles:
         made.lower = wp.array(lower, dtype=wp.vec3, device=device)
         made.values = wp.array(np.concatenate(values), dtype=wp.float32, device=device)
         return made
+
+
+def measured_gaps(
+    shapes: Shapes,
+    poses: wp.array,
+    obstacles: npt.ArrayLike,
+    worlds: npt.ArrayLike,
+    points: npt.NDArray[np.float64],
+    most: float = 1.0,
+) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
+    """Distances of points from obstacles [m], [n, k], and the directions out of these, [n, k, 3]; waits for the device.
+
+    Args:
+        shapes, poses: The obstacles, and their poses [worlds, O].
+        obstacles, worlds: The number of an obstacle and of its world for each row of points, [n].
+        points: [m], [n, k, 3].
+        most: Larger distances are only known to be larger.
+    """
+    device = poses.device
+    numbers = [wp.array(each, dtype=wp.int32, device=device) for each in (obstacles, worlds)]
+    asked = wp.array(points, dtype=wp.vec3, device=device)
+    gaps, normals = (wp.zeros(asked.shape, dtype=dtype, device=device) for dtype in (wp.float32, wp.vec3))
+    wp.launch(measure_gaps, asked.shape, [shapes, poses, *numbers, asked, most], [gaps, normals], device=device)
+    return gaps.numpy(), normals.numpy()
 
 
 def _first_pose(tool: Tool) -> npt.NDArray[np.float64]:

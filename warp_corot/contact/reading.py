@@ -8,16 +8,15 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-import warp as wp
 
-from warp_corot.kernels.contact import sums
 from warp_corot.mesh.surfaces.bound import SurfaceMesh
+
+from .obstacles import RigidForces, measured_gaps
 
 if TYPE_CHECKING:
     from warp_corot.body.soft_body import SoftBody
 
     from .contacts import Contacts
-    from .obstacles import RigidForces
     from .pairs import Pairs
     from .tool import Obstacle
 
@@ -113,14 +112,12 @@ def _of_pairs(pairs: Pairs, x: Floats, nodes: int) -> Iterator[ActingRow]:
 
 
 def _at_places(contacts: Contacts, rigid: RigidForces, x: Floats) -> Iterator[ActingRow]:
-    obstacles = contacts.obstacles
-    gaps = wp.zeros(rigid.forces.shape, dtype=wp.float32, device=contacts.device)
-    normals = wp.zeros(rigid.forces.shape, dtype=wp.vec3, device=contacts.device)
-    inputs = [obstacles.shapes, obstacles.motions, contacts.surface.arrays, rigid.forces]
-    wp.launch(sums.describe_touches, rigid.forces.shape, inputs, [gaps, normals], device=contacts.device)
-    gap, (force, normal) = gaps.numpy(), (each.numpy().astype(float) for each in (rigid.forces, normals))
-    for o, s in np.argwhere(force.any(axis=2)):
-        yield ActingRow(int(o), 1, np.array([s]), np.ones(1), x[s], normal[o, s], float(gap[o, s]), force[o, s])
+    forces, obstacles = rigid.forces.numpy().astype(float), contacts.obstacles
+    those, places = np.nonzero(forces.any(axis=2))
+    given = those, contacts.surface.arrays.world.numpy()[places], x[places, None]
+    gap, normal = (each[:, 0].astype(float) for each in measured_gaps(obstacles.shapes, obstacles.motions.now, *given))
+    for k, (o, s) in enumerate(zip(those, places, strict=True)):
+        yield ActingRow(int(o), 1, np.array([s]), np.ones(1), x[s], normal[k], float(gap[k]), forces[o, s])
 
 
 def _at_triangles(rigid: RigidForces, corners: npt.NDArray[np.integer], x: Floats) -> Iterator[ActingRow]:

@@ -14,10 +14,9 @@ from warp_corot.errors import StabilityWarning, depth_of_user
 from warp_corot.kernels.contact import shapes as kinds
 from warp_corot.kernels.contact import sums
 from warp_corot.kernels.contact.crushed import count_crushed
-from warp_corot.kernels.contact.motion import Motions
-from warp_corot.kernels.contact.sums import find_gaps
 from warp_corot.solvers.halo import ALONE
 
+from .obstacles import measured_gaps
 from .shapes import Capsule, Cylinder, Ground, SignedDistance, TriangleMesh
 from .tool import FITTING
 
@@ -162,15 +161,13 @@ def _depths(surface: Floats, triangles: npt.NDArray[np.int32], points: Floats, d
         return depths
     corners = wp.array(surface, dtype=wp.vec3, device=device)
     mesh = wp.Mesh(corners, wp.array(triangles.ravel(), dtype=wp.int32, device=device))
-    shape, motions = kinds.Shapes(), Motions()
+    shape = kinds.Shapes()
     shape.kind = wp.array([int(kinds.MESH)], dtype=wp.int32, device=device)
     shape.size = wp.array([[1e-6 * reach, 0.0, 0.0]], dtype=wp.vec3, device=device)
     shape.source = wp.array([mesh.id], dtype=wp.uint64, device=device)
-    motions.later = wp.array([[[0, 0, 0, 0, 0, 0, 1]]], dtype=wp.transform, device=device)
-    found = wp.zeros((1, int(inside.sum())), dtype=wp.float32, device=device)
-    asked = wp.array(points[inside], dtype=wp.vec3, device=device)
-    wp.launch(find_gaps, found.shape, [shape, motions, 0, asked, reach], [found], device=device)
-    depths[inside] = np.maximum(-found.numpy()[0], 0.0)
+    pose = wp.array([[[0, 0, 0, 0, 0, 0, 1]]], dtype=wp.transform, device=device)
+    gaps, _ = measured_gaps(shape, pose, [0], [0], points[inside][None], reach)
+    depths[inside] = np.maximum(-gaps[0], 0.0)
     return depths
 
 

@@ -11,6 +11,7 @@ import numpy.typing as npt
 import warp as wp
 
 from warp_corot.contact.contacts import Contacts
+from warp_corot.contact.obstacles import measured_gaps
 from warp_corot.contact.reading import ActingRow, acting_rows
 from warp_corot.errors import InputError
 from warp_corot.kernels.gradients import contact as kernels
@@ -145,7 +146,9 @@ class RestingContact:
         points = np.array([column.row.point for column in columns]).reshape(-1, 1, 3)
         worlds = [int(column.nodes[0]) * self._body.worlds // self._body.sizes.nodes for column in columns]
         steps = step * np.concatenate([np.eye(3), -np.eye(3)])
-        found = normals_at(self._contacts, [column.row.obstacle for column in columns], worlds, points + steps)
+        given = [column.row.obstacle for column in columns], worlds, points + steps
+        obstacles = self._contacts.obstacles
+        found = measured_gaps(obstacles.shapes, obstacles.motions.later, *given)[1].astype(float)
         slopes = (found[:, :3] - found[:, 3:]) / (2.0 * step)
         curvatures[self.obstacle >= 0] = 0.5 * (slopes + np.swapaxes(slopes, 1, 2))
         return curvatures
@@ -370,18 +373,9 @@ def rows_after(body: SoftBody, contacts: Contacts) -> list[ActingRow]:
     world, at = np.divmod(np.array([int(row.places[0]) for row in rows], int) - part.start, part.nodes)
     nodes = part.skin.nodes[at] + world * body.world_node_count
     x = (body.rest_positions + body.state.displacements.numpy()[: body.sizes.nodes, :3])[nodes]
-    normals = normals_at(contacts, [row.obstacle for row in rows], world, x[:, None])[:, 0]
+    given = [row.obstacle for row in rows], world, x[:, None]
+    normals = measured_gaps(contacts.obstacles.shapes, contacts.obstacles.motions.later, *given)[1][:, 0].astype(float)
     return [row._replace(point=p, normal=n) for row, p, n in zip(rows, x, normals, strict=True)]
-
-
-def normals_at(contacts: Contacts, obstacles: npt.ArrayLike, worlds: npt.ArrayLike, points: Array) -> Array:
-    """Normals of obstacles in their worlds at points [m], [n, k, 3]; waits for the device."""
-    device = contacts.device
-    inputs = [contacts.obstacles.shapes, contacts.obstacles.motions, _ints(obstacles, device), _ints(worlds, device)]
-    inputs.append(wp.array(points, dtype=wp.vec3, device=device))
-    found = wp.zeros(points.shape[:2], dtype=wp.vec3, device=device)
-    wp.launch(kernels.find_normals, found.shape, inputs, [found], device=device)
-    return found.numpy().astype(float)
 
 
 def _inverse(matrix: Array) -> Array:
