@@ -13,15 +13,14 @@ from warp_corot.kernels.modules import INLINED
 from warp_corot.kernels.stepping.pace import DONE, DT, Pace, length_before
 
 from .bearing import find_borne, is_borne
-from .end import push
+from .explicit_step import push
 from .mass_split import Sums, take_force
 from .motion import Bearing, Foreseen, Motions, Surface, distance_between, foreseen, kick_of
-from .near import FAR, Near
 from .shapes import GROUND, distance_to, sure_distance
 from .touches import Touches
 from .vertices import FORESEEN, OUT, Rigid
 from .visits import LATE, LISTED, Part, Visits, append, choose, claim, lower_budget
-from .watch import FARTHEST, STABLE, Watch, begin_obstacle, pair_of
+from .watch import FAR, FARTHEST, STABLE, Near, Watch, begin_obstacle, pair_of
 
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": INLINED})
 

@@ -5,12 +5,24 @@ import warp as wp
 from warp_corot.kernels.stepping.threads import spread_thread, synchronize_grid
 
 from .boxes import raise_by_warp
-from .near import AROUND, BESIDE, Near, add_motion, begin_search, leave_room, mark
 from .shapes import GROUND, distance_to, sure_distance
 from .sleep import end_search
 from .touches import Touches
 from .vertices import Rigid
-from .watch import ASKED, FARTHEST, Watch, end_asking, fastest_motion
+from .watch import (
+    AROUND,
+    ASKED,
+    BESIDE,
+    FARTHEST,
+    Near,
+    Watch,
+    add_motion,
+    begin_search,
+    end_asking,
+    fastest_motion,
+    leave_room,
+    mark,
+)
 
 wp.set_module_options({"enable_backward": False})
 

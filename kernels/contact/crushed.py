@@ -9,8 +9,7 @@ from warp_corot.kernels.elements.elements import frame, local_gradient
 from warp_corot.kernels.modules import unique_kernel
 
 from .motion import Surface
-from .near import CRUSHED, Near
-from .watch import Watch
+from .watch import CRUSHED, Near, Watch
 
 wp.set_module_options({"enable_backward": False})
 

@@ -13,13 +13,12 @@ from warp_corot.kernels.elements.elements import load_node, store_node
 from warp_corot.kernels.implicit.assembled import Couplings, add_block, begin_coupling, end_coupling, root_columns
 from warp_corot.kernels.implicit.line_search import TRIED
 
-from .bearing import is_borne
+from .bearing import is_borne, loose_at, loose_part
 from .carriers import Carriers, couple_at, ease_at, mark_carriers, motion_at, push_at
 from .contact_curvature import Rolling, share_of_moment, tilted
 from .motion import Surface
 from .rows import Rows, row_count
 from .springs import bound_of, spring_state
-from .supports import loose_at, loose_part
 from .touches import Touches
 
 wp.set_module_options({"enable_backward": False})

@@ -21,15 +21,14 @@ from warp_corot.kernels.modules import unique_kernel
 from warp_corot.kernels.stepping.pace import DT, Pace
 from warp_corot.kernels.stepping.threads import spread_thread, synchronize_blocks, synchronize_grid
 
-from .bearing import is_borne, loose_share
+from .bearing import MOSTLY, is_borne, left_between, loose_share
 from .law import Law, held_back, least_motion, left_to_held
+from .locate import list_by_warp, locate_row
 from .motion import Surface
-from .near import BESIDE, Near
-from .pairs import list_by_warp, locate_row
 from .rows import Meeting, Rows, row_count
-from .supports import MOSTLY, left_between
 from .touches import Touches, find_touch
 from .vertices import ACTS, BEGINS, ENDS, OUT, WAITS, Rigid, across, anchor, begin_place
+from .watch import BESIDE, Near
 
 wp.set_module_options({"enable_backward": False})
 

@@ -13,11 +13,10 @@ from warp_corot.kernels.stepping.pace import Pace
 from .bearing import is_borne
 from .law import Law
 from .motion import Surface, foreseen
-from .near import Near
 from .rows import Rows, row_count
 from .vertices import FORESEEN, WAITS
 from .visits import Part, Visits, append, choose
-from .watch import FARTHEST, Watch
+from .watch import FARTHEST, Near, Watch
 
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": INLINED})
 

@@ -4,7 +4,7 @@ import warp as wp
 
 from warp_corot.kernels.stepping.pace import DT, Pace
 
-from .bearing import is_borne
+from .bearing import is_borne, left_at
 from .carriers import Carriers, crowd_at, is_held_at, motion_at
 from .contact_curvature import Rolling, rolling_of, tilted
 from .implicit_rows import AGAIN, FIRST, MISSING, ImplicitRows, corner_weights, list_row
@@ -12,7 +12,6 @@ from .law import Law, held_back
 from .motion import Motions, Surface
 from .shapes import CAPSULE, GROUND, SPHERE, Shapes, carried, distance_to
 from .springs import QUARTERED, kept_gap
-from .supports import left_at
 from .touches import CORNER, SKEWERED, Touches, nearest
 from .vertices import across
 

@@ -10,9 +10,8 @@ from .boxes import edge_reach, lower_end, triangle_reach, triangle_size, upper_e
 from .closest import on_segments, on_triangle, point_of
 from .locate import BORDER, ENDS, FACING, edge_normal, node_faces_at_rest
 from .motion import Surface
-from .near import CRUSHED, PAIRED, Near, mark
 from .rows import BAND, BAND_AT_REST, Meeting, OldRows, Rows
-from .watch import Watch, ahead_at
+from .watch import CRUSHED, PAIRED, Near, Watch, ahead_at, mark
 from .wide_tree import BLUNT, MAY_FACE, NEARLY, WideTree, query_wide
 
 wp.set_module_options({"enable_backward": False})

@@ -10,10 +10,9 @@ from warp_corot.kernels.stepping.threads import lanes_with, of_first_lane, sum_b
 
 from .boxes import edge_reach, lower_end, root_of, upper_end
 from .motion import Surface
-from .near import Near
 from .rows import Meeting, OldRows, Rows
 from .search import SHARP, bend, edge_is_near, finds_pairs, mark_row, node_is_near, node_normal
-from .watch import Watch
+from .watch import Near, Watch
 
 wp.set_module_options({"enable_backward": False})
 

@@ -11,8 +11,7 @@ from warp_corot.kernels.elements.elements import load_node
 from warp_corot.kernels.stepping.pace import DONE, DT, Pace
 
 from .motion import Motions, Surface
-from .near import Near
-from .watch import HIT, SKIN, Watch, begin_obstacle, pair_of, reserved, stays, wake
+from .watch import HIT, SKIN, Near, Watch, begin_obstacle, pair_of, reserved, stays, wake
 
 wp.set_module_options({"enable_backward": False})
 

@@ -7,11 +7,11 @@ import warp as wp
 from warp_corot.kernels.modules import INLINED, unique_kernel
 from warp_corot.kernels.stepping.pace import DT, Pace
 
+from .locate import list_by_warp
 from .mass_split import LOCATE, Contact, Contacts, Sums, clear_lists, end_place, parents_of, phases
 from .motion import Surface
-from .near import Near
-from .pairs import list_by_warp
 from .vertices import OUT, WAITS
+from .watch import Near
 
 wp.set_module_options({"enable_backward": False})
 

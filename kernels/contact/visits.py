@@ -5,7 +5,7 @@ import warp as wp
 from warp_corot.kernels.elements.simd8 import on_cpu
 
 from .motion import Dynamics, Surface
-from .near import BESIDE, Near
+from .watch import BESIDE, Near
 
 wp.set_module_options({"enable_backward": False})
 

@@ -12,9 +12,8 @@ from warp_corot.kernels.modules import INLINED
 
 from .boxes import edge_reach, triangle_reach, triangle_size
 from .motion import Surface
-from .near import FAR
 from .rows import BAND, Meeting
-from .watch import Watch
+from .watch import FAR, Watch
 
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": INLINED})
 

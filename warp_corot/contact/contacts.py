@@ -11,16 +11,14 @@ import warp as wp
 
 from warp_corot.inputs.cpu_threads import Regions, launch, team_of
 from warp_corot.kernels.contact import bearing, motion, sums
-from warp_corot.kernels.contact.begin import BLOCK, begin_step
-from warp_corot.kernels.contact.end import end_contact
+from warp_corot.kernels.contact.explicit_step import BLOCK, begin_step, end_contact
 from warp_corot.kernels.contact.law import SETTLING, Law
 from warp_corot.solvers.halo import ALONE
 from warp_corot.solvers.system import System
 
-from .approach import Approach
 from .carried import CarriedForces
 from .implicit import ImplicitContact
-from .mass_split import MassSplit
+from .mass_split import Approach, MassSplit
 from .obstacles import Obstacles, RigidForces
 from .options import SURFACE, Contact, may_meet
 from .pairs import Pairs, smallest_size

@@ -10,7 +10,6 @@ import warp as wp
 
 from warp_corot.errors import UnstableError
 from warp_corot.kernels.contact import beside
-from warp_corot.kernels.contact import near as near_kernels
 from warp_corot.kernels.contact import sleep as sleeping
 from warp_corot.kernels.contact import watch as kernels
 from warp_corot.kernels.contact.touches import Touches
@@ -31,7 +30,7 @@ LEAST, WIDER = 0.05, 4.0
 MOST_THREADS = 1 << 18
 #: Number of threads of a block, and of resident blocks on each multiprocessor.
 BLOCK, BLOCKS_EACH = int(beside.BLOCK), 4
-#: The report of the device to the host: see ``kernels.contact.near.report_search``.
+#: The report of the device to the host: see ``kernels.contact.watch.report_search``.
 PAIRS, MISSED, SEARCHES = range(3)
 
 
@@ -79,7 +78,7 @@ class Search:
         shape = (surface.worlds, obstacles.count)
         watch.poses = wp.zeros(shape, dtype=wp.transform, device=device)
         watch.reach_of = wp.zeros(shape, dtype=wp.float32, device=device)
-        self.watch, self.near = watch, near_kernels.Near()
+        self.watch, self.near = watch, kernels.Near()
         self._taken, self._foresees = -1, False
         #: Whether the device can skip recorded launches; otherwise every kernel of a search tests whether it is due.
         self._branches = device.is_cpu or (branches and wp.is_conditional_graph_supported())
@@ -204,7 +203,7 @@ class Search:
 
     def launch_report(self) -> None:
         """Launch the report to the host after a run."""
-        wp.launch(near_kernels.report_search, 1, [self.watch, self.most, self._report.array], device=self.device)
+        wp.launch(kernels.report_search, 1, [self.watch, self.most, self._report.array], device=self.device)
 
     def _search(self, is_framed: bool, sleeps: bool) -> None:
         asks = 0 if not is_framed else 2 if len(self.surface.parts) == 1 else 1

@@ -38,10 +38,9 @@ IMPLICIT_ON_FORESTS = (
 )
 #: Modules for explicit contact, besides its solver; and those for soft surfaces on the CPU.
 CONTACT = (
-    *("contact.begin", "contact.sums", "contact.beside", "contact.sleep", "contact.watch", "contact.near"),
-    *("contact.end", "contact.bearing"),
+    *("contact.explicit_step", "contact.sums", "contact.beside", "contact.sleep", "contact.watch", "contact.bearing"),
 )
-CONTACT_ON_CPU = ("contact.approach", "contact.begin", "contact.sums", "contact.near", "contact.bearing")
+CONTACT_ON_CPU = ("contact.approach", "contact.explicit_step", "contact.sums", "contact.watch", "contact.bearing")
 PAIRS_ON_CPU = ("contact.rows", "contact.wide_tree", "contact.boxes", "contact.nearing", "contact.motion")
 
 #: A kernel, or one with the number of threads of its blocks on CUDA, if that is not Warp's default.
