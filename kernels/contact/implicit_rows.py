@@ -471,22 +471,6 @@ def gather_stiffness(threads: int, rows: ImplicitRows, stiffness: wp.array[wp.ma
 
 
 @wp.kernel(enable_backward=False)
-def find_bearers(start: int, surface: Surface, bearers: Surface, nodes: wp.array[wp.vec4i], weights: wp.array[wp.vec4]):
-    """Find the nodes that bear each place of a body, and their weights; -1 where there is none."""
-    k = wp.tid()
-    s = start + k
-    found = wp.vec4i(-1, -1, -1, -1)
-    found[0] = surface.node[s]
-    weights[k] = wp.vec4(1.0, 0.0, 0.0, 0.0)
-    if is_borne(s, surface):
-        b = surface.bearing.bearers[s]
-        weights[k] = surface.bearing.weights[s]
-        for m in range(4):
-            found[m] = wp.where(surface.bearing.weights[s][m] != 0.0, bearers.node[b[m]], -1)
-    nodes[k] = found
-
-
-@wp.kernel(enable_backward=False)
 def scale_nodes(
     start: int,
     is_after: int,

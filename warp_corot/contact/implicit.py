@@ -120,11 +120,16 @@ class ImplicitContact:
         """The places of a body and the stiffness of obstacles there, for a preconditioner; not while launches are
         recorded."""
         if k not in self._springs:
-            part, count = self._surface.parts[k], self.places_of(k)
-            nodes, weights = self._zeros(count, wp.vec4i), self._zeros(count, wp.vec4)
-            inputs = [part.start, self._surface.arrays, self._surface.bearers]
-            wp.launch(kernels.find_bearers, count, inputs, [nodes, weights], device=self.device)
-            self._springs[k] = Springs(nodes, weights, self._stiffness[part.start : part.start + count])
+            surface, at = self._surface, self._surface.places_of(k)
+            nodes = np.stack([surface.arrays.node.numpy()[at], *np.full((3, self.places_of(k)), -1)], axis=1)
+            weights = np.where(nodes >= 0, 1.0, 0.0)
+            if surface.parts[k].bearers:
+                weights = np.where(nodes[:, :1] >= 0, surface.arrays.bearing.weights.numpy()[at], 0.0)
+                bearers = surface.bearers.node.numpy()[surface.arrays.bearing.bearers.numpy()[at]]
+                nodes = np.where(weights != 0.0, bearers, -1)
+            weights_ = wp.array(weights, dtype=wp.vec4, device=self.device)
+            nodes_ = wp.array(nodes, dtype=wp.vec4i, device=self.device)
+            self._springs[k] = Springs(nodes_, weights_, self._stiffness[at])
         return self._springs[k]
 
     def places_of(self, k: int) -> int:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -18,7 +18,7 @@ from warp_corot.solvers.halo import ALONE, Halo
 from .operator import Preconditioner, Product
 
 if TYPE_CHECKING:
-    from .contact_constraints import Contact
+    from .contact_constraints import SolvedContact
 
 #: Number of lanes in a warp, minimum number of nodes of a thread, and maximum number of warps of all worlds.
 WARP, NODES, WARPS = 32, 4, 512
@@ -221,15 +221,6 @@ class ConjugateGradients:
         )
 
 
-class Contacts(Protocol):
-    """Forces of contacts as functions of the motions in a step."""
-
-    def add_slopes(self, d: wp.array, change: wp.array, search: wp.array, slopes: wp.array) -> None:
-        """Launch the addition of the contacts' power along a change from motions d, at the share in ``search``, to
-        ``slopes``, float64 [worlds]."""
-        ...
-
-
 class LineSearch:
     """Finds how much of a change of the motions to take, in each world.
 
@@ -238,19 +229,28 @@ class LineSearch:
         count: Number of entries of each world.
         contacts: The contacts that open and close.
         device: The device.
+        ranks: The ranks with the other entries of each world, which find the same share.
+        places: The number of a body and of its places in a world, whose powers the ranks add up.
     """
 
-    _ranks: Halo = ALONE
-
-    def __init__(self, worlds: int, count: int, contacts: Contacts, device: wp.Device):
+    def __init__(
+        self,
+        worlds: int,
+        count: int,
+        contacts: SolvedContact,
+        device: wp.Device,
+        *,
+        ranks: Halo = ALONE,
+        places: tuple[int, int] = (0, 0),
+    ):
         self._worlds, self._count, self._contacts, self.device = worlds, count, contacts, device
-        self._power, self._loss = (WorldSums(worlds, count, 1, device, self._ranks) for _ in range(2))
+        self._power, self._loss = (WorldSums(worlds, count, 1, device, ranks) for _ in range(2))
         self._search = wp.zeros((worlds, searches.COLUMNS), dtype=wp.float64, device=device)
-        self._slopes = wp.zeros(worlds, dtype=wp.float64, device=device)
+        # The sums of worlds are in the first places.
+        self._ranks, self._body = ranks, None if ranks.is_alone else places[0]
+        self._addends = wp.zeros((worlds, max(places[1], 1), 1), dtype=wp.float64, device=device)
+        self._slopes = self._addends[:, 0, 0]
         self._searching = wp.zeros(1, dtype=wp.int32, device=device)
-
-    def _add_slopes(self, d: wp.array, change: wp.array) -> None:
-        self._contacts.add_slopes(d, change, self._search, self._slopes)
 
     def launch(
         self, rest: wp.array, product: wp.array, change: wp.array, d: wp.array, image: wp.array | None = None
@@ -277,32 +277,13 @@ class LineSearch:
                 self._launch(searches.add_share, self._worlds * self._count, inputs)
 
     def _try(self, d: wp.array, change: wp.array) -> None:
-        self._add_slopes(d, change)
+        if self._body is None:
+            self._contacts.add_slopes(d, change, self._search, self._slopes)
+        else:
+            self._addends.zero_()
+            self._contacts.add_slopes(d, change, self._search, self._addends.flatten(), apart=self._body)
+            take_in(self._addends, [0], self._ranks)
         self._launch(searches.take_trial, self._worlds, [self._search, self._slopes, self._searching])
 
     def _launch(self, kernel: wp.Kernel, dim: int, inputs: list) -> None:
         wp.launch(kernel, dim, inputs, device=self.device)
-
-
-class SharedLineSearch(LineSearch):
-    """A line search of several ranks, all of which find the same share.
-
-    Args:
-        worlds, count, contacts, device: As for ``LineSearch``.
-        body: The number of the body.
-        ranks: The ranks with the other entries of each world.
-    """
-
-    def __init__(self, worlds: int, count: int, contacts: Contact, body: int, device: wp.Device, ranks: Halo):
-        self._ranks, self._apart, self._body = ranks, contacts, body
-        super().__init__(worlds, count, contacts, device)
-        # The sums of worlds are in the first places.
-        self._addends = wp.zeros(
-            (worlds, max(contacts.places_of(body) // worlds, 1), 1), dtype=wp.float64, device=device
-        )
-        self._slopes = self._addends[:, 0, 0]
-
-    def _add_slopes(self, d: wp.array, change: wp.array) -> None:
-        self._addends.zero_()
-        self._apart.add_slopes(d, change, self._search, self._addends.flatten(), apart=self._body)
-        take_in(self._addends, [0], self._ranks)

@@ -9,7 +9,7 @@ import warp as wp
 from warp_corot.kernels.implicit import contact_solve as kernels
 
 from .block_system import BlockSystem
-from .conjugate_gradients import LineSearch, SharedLineSearch
+from .conjugate_gradients import LineSearch
 
 if TYPE_CHECKING:
     from .newton import Newton
@@ -41,10 +41,11 @@ class ContactSolve:
             wp.zeros(length, dtype=wp.vec4, device=self.device) for _ in range(6)
         )
         sizes = system.worlds, system.node_count
-        self._search = LineSearch(*sizes, self._contact, self.device)
+        places = (0, 0)
         if not system.ranks.is_alone:
             body = newtons[0].operator.number
-            self._search = SharedLineSearch(*sizes, self._contact, body, self.device, system.ranks)
+            places = (body, self._contact.places_of(body) // system.worlds)
+        self._search = LineSearch(*sizes, self._contact, self.device, ranks=system.ranks, places=places)
         self.iterations = wp.zeros_like(system.solver.iterations)
         self._outer = wp.zeros(system.worlds, dtype=wp.float64, device=self.device)
         self._rounds, self._going, self._again, *none = (
