@@ -29,7 +29,7 @@ from warp_corot.kernels.corotated.tangent import keep_gradients
 from warp_corot.kernels.elements.constitutive import hooke, symmetric
 from warp_corot.kernels.elements.elements import GeneralElements, add_force, load_node, store_node
 from warp_corot.kernels.implicit.assembled import root_columns
-from warp_corot.kernels.implicit.increments import COLUMNS, Sums, motion_of
+from warp_corot.kernels.implicit.increments import MOTION_COLUMNS, Sums, motion_of
 from warp_corot.kernels.implicit.line_search import TRIED
 from warp_corot.kernels.math.rotation import byers_xu, identity3
 from warp_corot.kernels.stepping.balance import sum_of_lanes
@@ -268,7 +268,7 @@ def sum_motion(
         else:
             total += motion_of(wp.float64(0.0), True, wp.vec3d(), wp.vec3d())
         k += threads
-    for column in range(COLUMNS):
+    for column in range(MOTION_COLUMNS):
         part = sum_of_lanes(total[column])
         if thread % lanes == 0:
             parts[piece, thread / lanes, column] = part
