@@ -34,7 +34,7 @@ def measured(path: Path, options: list[str], tets: int, device: str) -> dict[str
     from warp_corot.cli.input_file import bodies_in, open_input
     from warp_corot.cli.input_mesh import find_organ
     from warp_corot.errors import InputError
-    from warp_corot.io.read.tetrahedra import load_tets
+    from warp_corot.io.read.meshes import load_tets
 
     wp.config.log_level = wp.LOG_ERROR
     line = ["simulate", str(path), "-o", "out.usd", "--tets", str(tets), "--device", device, *options]
@@ -46,7 +46,7 @@ def measured(path: Path, options: list[str], tets: int, device: str) -> dict[str
             wall, cpu, own = time.perf_counter(), time.process_time(), time.thread_time()
             opened = open_input(str(path))
             if opened.kind == "tets":
-                return {"tets": len(load_tets(path).tets)}
+                return {"tets": len(load_tets(path).cells)}
             subjects = [find_organ(part, own) for part, own in bodies_in(opened, args)]
             seconds, cpu_seconds = time.perf_counter() - wall, time.process_time() - cpu
             own_seconds = time.thread_time() - own

@@ -25,7 +25,7 @@ import warp as wp
 from measure import machine, number, save, table, tell
 
 from warp_corot import envs
-from warp_corot.inputs.device import checked_device
+from warp_corot.inputs.checks import checked_device
 
 #: Cubes along each edge of the bodies over the tasks' own, and the steps on which policies are tried.
 BODIES = ((1, "explicit"), (1, "implicit"), (2, "explicit"), (2, "implicit"))

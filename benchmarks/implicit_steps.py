@@ -25,7 +25,7 @@ import warp as wp
 from measure import Parser, machine, number, save, table, tell
 
 import warp_corot as wc
-from warp_corot.inputs.device import checked_device
+from warp_corot.inputs.checks import checked_device
 
 #: The time is divided into parts [s]. The first ones record the steps and are not timed.
 PART, WARM_UP, PARTS = 0.14, 2, 5

@@ -24,7 +24,7 @@ import warp as wp
 
 import warp_corot as wc
 from warp_corot.errors import InputError
-from warp_corot.inputs.device import checked_device
+from warp_corot.inputs.checks import checked_device
 
 #: A sample replays its graph for about this long [s].
 SAMPLE_SECONDS = {"cuda": 3e-3, "cpu": 3e-2}

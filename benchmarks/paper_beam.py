@@ -21,7 +21,7 @@ from warp_corot.body.soft_body import SoftBody
 from warp_corot.elasticity import Corotated, Linear, Model, NeoHookean, StVenantKirchhoff
 from warp_corot.elasticity.dilatation import ELEMENT
 from warp_corot.errors import InputError
-from warp_corot.inputs.device import checked_device
+from warp_corot.inputs.checks import checked_device
 from warp_corot.materials.isotropic import Isotropic
 from warp_corot.mesh import TetForest
 from warp_corot.mesh.topology import signed_volumes

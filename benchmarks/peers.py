@@ -48,8 +48,7 @@ from stage_cases import SVD_WRONG
 import warp_corot as wc
 from warp_corot.elasticity import Model
 from warp_corot.elasticity.polar import rotation_function
-from warp_corot.kernels.math.polar import rotate_all
-from warp_corot.kernels.math.rotation import byers_xu
+from warp_corot.kernels.math.rotation import byers_xu, rotate_all
 
 HEADER = ("stage", "variant", "ns/tet", "spread", "Gtet/s", "x ours", "error", "largest dt", "simulated s/s")
 

@@ -20,7 +20,7 @@ import warp as wp
 from warp_corot.body.soft_body import SoftBody
 from warp_corot.domain import Domain
 from warp_corot.errors import InputError
-from warp_corot.inputs.device import checked_device
+from warp_corot.inputs.checks import checked_device
 from warp_corot.kernels.remesh.criteria import elongation, nearness, strain
 from warp_corot.materials.isotropic import Isotropic
 from warp_corot.mesh import TetForest

@@ -41,7 +41,7 @@ from measure import machine, number, table, tell
 from scipy.spatial import cKDTree
 
 import warp_corot as wc
-from warp_corot.inputs.device import checked_device
+from warp_corot.inputs.checks import checked_device
 
 FRAME = 1.0 / 60.0
 DOWN = (0.0, -9.81, 0.0)

@@ -29,7 +29,7 @@ from scipy.sparse import csr_matrix, diags
 from scipy.sparse.linalg import spsolve
 
 import warp_corot as wc
-from warp_corot.inputs.device import checked_device
+from warp_corot.inputs.checks import checked_device
 from warp_corot.solvers.implicit.conjugate_gradients import ConjugateGradients
 from warp_corot.solvers.implicit.preconditioners import BlockDiagonal, preconditioner_of
 from warp_corot.solvers.implicit.tangent import TangentOperator

@@ -21,9 +21,12 @@ from warp_corot.kernels.elements.elements import (
     node_displacements,
     shape_of,
 )
-from warp_corot.kernels.elements.shapes import rest_shape, stiffness_product, vec12
+from warp_corot.kernels.elements.shapes import STIFFNESS_LAMBDA, STIFFNESS_MU, Coefficients, mat43
 from warp_corot.kernels.math.rotation import identity3
 from warp_corot.kernels.modules import unique_kernel
+from warp_corot.kernels.tables.shapes import REST, fingerprint
+
+vec12 = wp.types.vector(length=12, dtype=wp.float32)
 
 wp.set_module_options({"enable_backward": False})
 
@@ -49,6 +52,47 @@ def square_factored_forces(
     p = r * hooke(corotated_strain(local_gradient(elements, t, u), q, r), mu[0], lam[0])
     f0, f1, f2, f3 = nodal_forces(elements, t, p)
     squares[t] = wp.length_sq(f0) + wp.length_sq(f1) + wp.length_sq(f2) + wp.length_sq(f3)
+
+
+@wp.func
+def rest_shape(shape: int):
+    """Node positions of a shape of edge length one in its own frame, a row a node."""
+    x0 = wp.static(mat43(*(x for node in REST[0] for x in node)))
+    if shape == 1:
+        x0 = wp.static(mat43(*(x for node in REST[1] for x in node)))
+    elif shape == 2:
+        x0 = wp.static(mat43(*(x for node in REST[2] for x in node)))
+    return x0
+
+
+@functools.cache
+def stiffness_product(shape: int, skip_zeros: bool = True) -> wp.Function:
+    """Generate y = (K_T / h) z for one shape; with ``skip_zeros=False`` all 144 products, the dense baseline."""
+    entries = Coefficients(STIFFNESS_LAMBDA[shape], STIFFNESS_MU[shape])
+    distinct, table, signs = list(entries.distinct), entries.table, entries.signs
+    if not skip_zeros:
+        distinct.append((0.0, 0.0))
+        table = [[len(distinct) - 1 if k < 0 else k for k in row] for row in table]
+    count = len(distinct)
+    coefficients_t = wp.types.vector(length=count, dtype=wp.float32)
+
+    @wp.func
+    def product(z: vec12, mu: float, lam: float):
+        _generated_from = wp.static(fingerprint(distinct, table, signs))
+        c = coefficients_t()
+        for k in range(wp.static(count)):
+            c[k] = wp.static(distinct[k][0]) * lam + wp.static(distinct[k][1]) * mu
+        y = vec12()
+        for i in range(12):
+            for j in range(12):
+                if wp.static(table[i][j] >= 0):
+                    if wp.static(signs[i][j] > 0.0):
+                        y[i] += c[wp.static(table[i][j])] * z[j]
+                    else:
+                        y[i] -= c[wp.static(table[i][j])] * z[j]
+        return y
+
+    return product
 
 
 @functools.cache

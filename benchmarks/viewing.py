@@ -12,7 +12,7 @@ import time
 
 from warp_corot.cli import make_parser
 from warp_corot.cli.run_setup import set_up
-from warp_corot.viewing.messages import frame_told
+from warp_corot.viewing.commands import frame_told
 from warp_corot.viewing.view import View
 
 #: Duration of a measurement, and of the time before it [s].

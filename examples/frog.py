@@ -16,7 +16,7 @@ from scipy.ndimage import binary_dilation, binary_erosion
 
 import warp_corot as wc
 from warp_corot.io.pictures.drawing import draw_body
-from warp_corot.io.read.volumes import load_volume
+from warp_corot.io.read.filemesh import load_volume
 
 parser = argparse.ArgumentParser(description=__doc__)
 parser.add_argument("--device", help="cpu or cuda:0")

@@ -40,10 +40,11 @@ class Family:
 
     Args:
         name: The beginning of the modules' names.
+        native: C++ that the modules include; None: none.
     """
 
-    def __init__(self, name: str):
-        self._name, self._factories, self._names = name, [], set()
+    def __init__(self, name: str, native: wp.ModuleBuildOptions | None = None):
+        self._name, self._factories, self._names, self._native = name, [], set(), native
         self._made = functools.cache(self._make)
 
     def member(self, factory: Callable[..., wp.Kernel]) -> Callable[..., wp.Kernel]:
@@ -61,5 +62,5 @@ class Family:
             name += "_"
         self._names.add(name)
         self._module = wp.get_module(name)
-        self._module.options["enable_backward"] = False
+        self._module.options |= {"enable_backward": False, "extra_build_options": self._native}
         return {factory.__name__: factory(*given) for factory in self._factories}

@@ -12,9 +12,8 @@ from warp_corot.elasticity.polar import polar_rotation
 from warp_corot.gradients.run import RunGradient, run_gradient
 from warp_corot.gradients.static import StaticGradient, static_gradient
 from warp_corot.io.write.animate import record
-from warp_corot.materials.anisotropic import Orthotropic, TransverselyIsotropic
+from warp_corot.materials.anisotropic import FibreReinforced, Orthotropic, TransverselyIsotropic
 from warp_corot.materials.isotropic import Isotropic
-from warp_corot.materials.reinforced import FibreReinforced
 from warp_corot.remesh.remeshing import OnlineRemesh
 from warp_corot.simulation.energy import Energy, WorldEnergies
 from warp_corot.simulation.progress import show_progress

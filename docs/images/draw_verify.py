@@ -15,7 +15,7 @@ from PIL import Image
 
 from warp_corot.experiments import CASES, Setup
 from warp_corot.io.pictures.drawing import Camera, draw_body
-from warp_corot.io.write.solids import poses_of, shape_of, solid_of
+from warp_corot.io.write.skins import poses_of, shape_of, solid_of
 
 #: Cases, and azimuth and elevation of the camera [°].
 SHOWN = {

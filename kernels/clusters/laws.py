@@ -21,19 +21,19 @@ from warp_corot.kernels.clusters.pairs import (
     vector_of,
 )
 from warp_corot.kernels.corotated.anisotropic import (
+    REINFORCED,
     OrthotropicMaterial,
+    ReinforcedMaterial,
     axes_of,
     filled,
-    material_strain,
-    turned_stress_of,
+    orthotropic_stress,
     vec9,
 )
 from warp_corot.kernels.corotated.well_conditioned import definite_law, definite_strain, is_definite, load_axes
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial
 from warp_corot.kernels.elements.dilatation import Dilatation, mean_of, pressure_stress_of
-from warp_corot.kernels.elements.fibres import ReinforcedMaterial, stress_in_axes
+from warp_corot.kernels.elements.simd8 import law_kernel
 from warp_corot.kernels.math.rotation import ITERATIONS, byers_xu, column, identity3, newton_rotation
-from warp_corot.kernels.modules import unique_kernel
 from warp_corot.kernels.stepping.block_memory import LOAD, STORE
 from warp_corot.kernels.stepping.threads import synchronize_block
 from warp_corot.kernels.tables.cluster_layout import QUAD_BYTES, PairLayout
@@ -73,8 +73,7 @@ def robust_stress(g: wp.mat33, m: wp.mat33, c: vec9, mu: float, lam: float):
     """
     turned_gradient = g * m
     r = byers_xu(m + turned_gradient)
-    stress, a = turned_stress_of(material_strain(turned_gradient, m, r), c, mu, lam)
-    return r * (stress + wp.skew(a)) * wp.transpose(m)
+    return orthotropic_stress(turned_gradient, m, r, c, mu, lam) * wp.transpose(m)
 
 
 @functools.cache
@@ -109,12 +108,13 @@ def anisotropic_law(transverse: bool) -> wp.Function:
     return anisotropic_law
 
 
+_reinforced_stress = REINFORCED.in_rest_axes
+
+
 @wp.func
 def reinforced_law(material: ReinforcedMaterial, listed: wp.array[wp.int32], i: int, scale: float, w: wp.mat33):
     """The law of Holzapfel, Gasser and Ogden, for elements whose axes are the axes of rest space."""
-    t = number_of(listed, i)
-    m = axes_of(material.fibres, t)
-    return scale * (m * stress_in_axes(wp.transpose(m) * w * m, material, t) * wp.transpose(m))
+    return scale * _reinforced_stress(number_of(listed, i), w, material)
 
 
 # --- groups that share their dilatation ------------------------------------------------------------------------------
@@ -230,7 +230,7 @@ def measure_pairs(Pairs: type, of: Dilatation, layout: PairLayout) -> wp.Kernel:
     threads, dilatations, fetch = layout.threads, pair_dilatations(of), fetch_records(Pairs)
     displacement = shared_quads(threads, "displacements")
 
-    @unique_kernel(grid_stride=False, launch_bounds=(threads, RESIDENT))
+    @law_kernel(grid_stride=False, launch_bounds=(threads, RESIDENT))
     def measure_pairs(
         # In
         clusters: PairClusters,

@@ -14,8 +14,8 @@ from typing import Any
 import warp as wp
 
 from warp_corot.kernels.elements.elements import ADD_FORCE
+from warp_corot.kernels.elements.simd8 import law_kernel
 from warp_corot.kernels.math.matrices import column
-from warp_corot.kernels.modules import unique_kernel
 from warp_corot.kernels.stepping.block_memory import LOAD, STORE
 from warp_corot.kernels.stepping.threads import synchronize_block
 from warp_corot.kernels.tables.cluster_layout import BANK_GROUPS, QUAD_BYTES, PairLayout
@@ -386,7 +386,7 @@ def scatter_pairs(
     forces, sum_of, fetch = pair_forces(law, given is not None), slot_sum(slot, zero), fetch_records(Pairs)
 
     # Code out of line runs rarely and must not take registers from the rest.
-    @unique_kernel(grid_stride=False, launch_bounds=(threads, layout.resident))
+    @law_kernel(grid_stride=False, launch_bounds=(threads, layout.resident))
     def scatter_pairs(
         # In
         clusters: PairClusters,

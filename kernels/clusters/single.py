@@ -11,8 +11,8 @@ import warp as wp
 
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial
 from warp_corot.kernels.elements.elements import LEVEL_MASK
+from warp_corot.kernels.elements.simd8 import law_kernel
 from warp_corot.kernels.math.matrices import column
-from warp_corot.kernels.modules import unique_kernel
 from warp_corot.kernels.stepping.block_memory import LOAD, STORE
 from warp_corot.kernels.stepping.threads import number_in, synchronize_block
 from warp_corot.kernels.tables.cluster_layout import DEFAULT_LAYOUT, NUMBERS, QUAD_BYTES, ClusterLayout
@@ -229,7 +229,7 @@ def scatter_clusters(law: wp.Function, layout: ClusterLayout = DEFAULT_LAYOUT) -
     sum_of = slot_sum(slot, corners)
 
     # Code out of line runs rarely and must not take registers from the rest.
-    @unique_kernel(grid_stride=False, launch_bounds=(threads, layout.resident))
+    @law_kernel(grid_stride=False, launch_bounds=(threads, layout.resident))
     def scatter_clusters(
         # In
         clusters: Clusters,

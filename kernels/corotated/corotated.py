@@ -16,21 +16,17 @@ from warp_corot.kernels.elements.constitutive import (
     corotated_strain,
     hooke,
     hooke_energy,
+    law_functions,
     rotated_stress,
+    symmetric,
 )
-from warp_corot.kernels.elements.elements import (
-    ForestElements,
-    add_force,
-    edge_length,
-    frame,
-    load_node,
-    local_gradient,
-    mirror_sign,
-    shape_of,
-)
-from warp_corot.kernels.elements.shapes import rest_shape, stiffness_product, vec12
-from warp_corot.kernels.math.rotation import identity3
-from warp_corot.kernels.modules import unique_kernel
+from warp_corot.kernels.elements.elements import frame, local_gradient
+from warp_corot.kernels.elements.forces import element_energies, element_von_mises, own_gradient
+from warp_corot.kernels.elements.simd8 import LAW_HEADERS
+from warp_corot.kernels.math.matrices import identity3
+from warp_corot.kernels.math.quaternion import robust_rotation
+from warp_corot.kernels.math.rotation import quick_rotation, rotation_out_of_line
+from warp_corot.kernels.modules import Family, unique_kernel
 
 wp.set_module_options({"enable_backward": False})
 
@@ -104,56 +100,97 @@ def extract_rotations(Elements: type, rotation: wp.Function) -> wp.Kernel:
     return extract_rotations
 
 
-# --- the explicit 12x12 product ------------------------------------------------------------------------------------
+# --- own rotations in closed form ------------------------------------------------------------------------------------
+#
+# The corotated stress without an iteration on matrices: the stretch S of F = R S by a root of its trace, with the
+# digits of E = F^T F - I however small it is, for J > 0: see ``native/laws.h``. Flat and turned over elements have
+# their rotations from ``robust_rotation``.
 
 
-@functools.cache
-def scatter_matrix_product(skip_zeros: bool) -> wp.Kernel:
-    """Corotated forces with given rotations by the explicit K_T of each type, zeros skipped or not."""
-    product0 = stiffness_product(0, skip_zeros)
-    product1 = stiffness_product(1, skip_zeros)
-    product2 = stiffness_product(2, skip_zeros)
+@wp.func_native("return corot::has_stretch(a);")
+def has_stretch(a: wp.mat33) -> bool:
+    """Whether F = I + A is neither flat, turned over nor far from order one."""
+    ...
 
-    @unique_kernel()
-    def scatter_matrix_product(
-        # In
-        elements: ForestElements,
-        material: RotatedMaterial,
-        u: wp.array[wp.vec4],
-        # Out
-        f: wp.array[wp.vec4],
-    ):
-        t = wp.tid()
-        nodes = elements.nodes[t]
-        targets = elements.targets[t]
-        code = elements.code[t]
-        shape = shape_of(code)
-        h = edge_length(elements, t)
-        s = mirror_sign(code)
-        mirror = wp.mat33(1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, s)
-        q = frame(elements, t) * mirror
-        r = material.rotations[material.unit[t]] * q
-        origin = load_node(u, nodes[0])
-        turned = wp.transpose(r) * q - identity3()
-        x0 = rest_shape(shape)
-        z = vec12()
-        for n in range(4):
-            # R^T x - x0 with x = Q x0 + u, from displacements so that nothing large cancels.
-            d = turned * (x0[n] * h) + wp.transpose(r) * (load_node(u, nodes[n]) - origin)
-            z[3 * n] = d[0]
-            z[3 * n + 1] = d[1]
-            z[3 * n + 2] = d[2]
-        y = vec12()
-        i = t * material.isotropic.stride
-        m = material.isotropic.mu[i] * h
-        k = material.isotropic.lam[i] * h
-        if shape == 0:
-            y = product0(z, m, k)
-        elif shape == 1:
-            y = product1(z, m, k)
-        else:
-            y = product2(z, m, k)
-        for n in range(4):
-            add_force(f, targets[n], -(r * wp.vec3(y[3 * n], y[3 * n + 1], y[3 * n + 2])))
 
-    return scatter_matrix_product
+closed_stress, _differential, closed_energy = law_functions("corot::Corotated{}")
+
+
+@wp.func
+def stretch_stress(a: wp.mat33, mu: float, lam: float):
+    """First Piola-Kirchhoff stress of the corotated law from the displacement gradient A in an orthonormal frame, and
+    whether it may be trusted; else it is zero."""
+    p = wp.mat33()
+    trusted = has_stretch(a)
+    if trusted:
+        p = closed_stress(a, mu, lam)
+    return p, trusted
+
+
+@wp.func
+def turned_stress(f: wp.mat33, mu: float, lam: float):
+    """As ``stretch_stress``, but from F and for every F. Where E is small the result loses digits."""
+    r = robust_rotation(f)
+    return (2.0 * mu) * f + (lam * (wp.ddot(r, f) - 3.0) - 2.0 * mu) * r
+
+
+@wp.func(inline=False)
+def turned_stress_out_of_line(f: wp.mat33, mu: float, lam: float):
+    return turned_stress(f, mu, lam)
+
+
+@wp.func
+def corotated_stress(a: wp.mat33, mu: float, lam: float):
+    """First Piola-Kirchhoff stress of the corotated law from any displacement gradient A."""
+    p, trusted = stretch_stress(a, mu, lam)
+    if not trusted:
+        p = turned_stress_out_of_line(identity3() + a, mu, lam)
+    return p
+
+
+OF_OWN_ROTATIONS = Family(__name__, LAW_HEADERS)
+
+
+@wp.func(inline=False)
+def turned_energy(f: wp.mat33, mu: float, lam: float):
+    """The density of F, for every F."""
+    strain = symmetric(wp.transpose(rotation_out_of_line(f)) * f) - identity3()
+    return hooke_energy(strain, mu, lam)
+
+
+@wp.func
+def corotated_energy(a: wp.mat33, mu: float, lam: float):
+    """The density of any displacement gradient A."""
+    density = float(0.0)
+    trusted = has_stretch(a)
+    if trusted:
+        density = closed_energy(a, mu, lam)
+    if not trusted:
+        density = turned_energy(identity3() + a, mu, lam)
+    return density
+
+
+@wp.func
+def own_density(elements: Any, t: int, material: IsotropicMaterial, u: wp.array[wp.vec4]):
+    """The density of an element with its own rotation."""
+    i = t * material.stride
+    return corotated_energy(own_gradient(elements, t, u), material.mu[i], material.lam[i])
+
+
+@wp.func
+def own_cauchy(elements: Any, t: int, material: IsotropicMaterial, u: wp.array[wp.vec4]):
+    """Cauchy stress of an element for display, with its own rotation."""
+    i = t * material.stride
+    g = local_gradient(elements, t, u)
+    q = frame(elements, t)
+    return hooke(corotated_strain(g, q, quick_rotation(q + g)), material.mu[i], material.lam[i])
+
+
+@OF_OWN_ROTATIONS.member
+def own_energies(Elements: type) -> wp.Kernel:
+    return element_energies(Elements, IsotropicMaterial, own_density, OF_OWN_ROTATIONS.kernel)
+
+
+@OF_OWN_ROTATIONS.member
+def own_von_mises(Elements: type) -> wp.Kernel:
+    return element_von_mises(Elements, IsotropicMaterial, own_cauchy, OF_OWN_ROTATIONS.kernel)

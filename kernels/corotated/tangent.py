@@ -18,37 +18,17 @@ from warp_corot.kernels.elements.constitutive import (
     symmetric,
 )
 from warp_corot.kernels.elements.elements import GeneralElements, frame, local_gradient
-from warp_corot.kernels.elements.simd8 import headers, scatter_simd8
-from warp_corot.kernels.math.matrices import axial, cofactor, column, identity3, largest_entry
+from warp_corot.kernels.elements.simd8 import headers, law_kernel, scatter_simd8
+from warp_corot.kernels.math.matrices import axial, identity3
 from warp_corot.kernels.modules import unique_kernel
 
 wp.set_module_options({"enable_backward": False})
 
-#: det(tr(S) I - S) / |S|^3, which is 1.54 at rest, below which the rotation is taken to turn less than it does, and the
-#: largest entry of S below which it is. Both at zero, F has no definite rotation and the derivative does not exist.
-LEAST_DEFINITENESS = wp.constant(1.0e-3)
-LEAST_STRETCH = wp.constant(1.0e-3)
 
-
-@wp.func
-def stretch_turning(strain: wp.mat33):
-    """tr(S) I - S of S scaled to order one, S = I + ``strain``: its adjugate, its determinant or what is put for one
-    near zero, and the scale."""
-    s = strain + identity3()
-    scale = 1.0 / wp.max(largest_entry(s), LEAST_STRETCH)
-    s = s * scale
-    h = wp.trace(s) * identity3() - s
-    adjugate = cofactor(h)
-    n2 = wp.ddot(s, s)
-    least = wp.max(LEAST_DEFINITENESS * n2 * wp.sqrt(n2), 1.0e-12)
-    return adjugate, wp.max(wp.dot(column(h, 0), column(adjugate, 0)), least), scale
-
-
-@wp.func
-def rotation_differential(strain: wp.mat33, b: wp.mat33):
-    """w of dR = R [w]x, for b = R^T dF."""
-    adjugate, det, scale = stretch_turning(strain)
-    return (scale / det) * (adjugate * axial(b))
+@wp.func_native("return corot::turning_of(strain);")
+def turning_of(strain: wp.mat33) -> wp.mat33:
+    """The matrix of axial(R^T dF) that gives w of dR = R [w]x, of S - I; bounded where F has no definite rotation."""
+    ...
 
 
 @wp.func
@@ -63,7 +43,7 @@ def given_differential(elements: Any, t: int, material: RotatedMaterial, u: wp.a
 def differential_of(r: wp.mat33, strain: wp.mat33, dg: wp.mat33, mu: float, lam: float):
     """With the rotation r of an element's F Q, and its change."""
     b = wp.transpose(r) * dg
-    turning = wp.skew(rotation_differential(strain, b))
+    turning = wp.skew(turning_of(strain) * axial(b))
     return r * (turning * hooke(strain, mu, lam) + hooke(symmetric(b - turning * strain), mu, lam))
 
 
@@ -181,7 +161,7 @@ def keep_gradients(elements: GeneralElements, t: int, turn: wp.mat33, gradients:
 #
 # With gradients of hat functions turned by R and G' = dF R^T, the stress is [t]x sigma(e') + sigma(sym(G' - [t]x e'))
 # of the turned strain e' = R e R^T, where t = R W R^T axial(G') and W is the matrix of
-# ``tangent.rotation_differential``. All of this is kept, so that a product reads 84 bytes an element and finds no
+# ``turning_of``. All of this is kept, so that a product reads 84 bytes an element and finds no
 # determinant.
 
 #: Numbers that an element keeps, and places of eight elements in their array, vec4.
@@ -208,7 +188,7 @@ def keep_numbers(first: int, gradients: wp.mat33, strain: wp.mat33, turning: wp.
 def keep_elements(rotation: wp.Function) -> wp.Kernel:
     """Write what products need, eight elements side by side."""
 
-    @unique_kernel()
+    @law_kernel()
     def keep_elements(
         # In
         elements: GeneralElements,
@@ -222,9 +202,8 @@ def keep_elements(rotation: wp.Function) -> wp.Kernel:
         first = 8 * EXACT_NUMBERS * (t / 8) + t % 8
         gradients = wp.sqrt(elements.volume[t]) * (elements.rest_inverse[t] * wp.transpose(r))
         strain = corotated_strain(g, identity3(), r)
-        adjugate, det, scale = stretch_turning(strain)
         turned = wp.transpose(r)
-        keep_numbers(first, gradients, r * strain * turned, (scale / det) * (r * adjugate * turned), kept)
+        keep_numbers(first, gradients, r * strain * turned, r * turning_of(strain) * turned, kept)
 
     return keep_elements
 

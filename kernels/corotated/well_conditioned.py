@@ -8,9 +8,12 @@ import warp as wp
 
 from warp_corot.kernels.math.rotation import ITERATIONS, column, identity3, reciprocal
 
-from .anisotropic import INDEFINITE, vec9
+from .anisotropic import vec9
 
 wp.set_module_options({"enable_backward": False})
+
+#: ``BLENDED`` of ``native/law_anisotropic.h``.
+INDEFINITE = wp.constant(0.4)
 
 
 @wp.func_native("""
@@ -38,7 +41,8 @@ def is_definite(e: wp.mat33):
 def definite_strain(
     z0: wp.vec3, z1: wp.vec3, z2: wp.vec3, f0: wp.vec3, f1: wp.vec3, f2: wp.vec3, g: wp.mat33, a: wp.mat33
 ):
-    """e = S - I to all its digits, as in ``stretch_strain``, from Z = 2^ITERATIONS R, the columns of F, of G, and A.
+    """e = S - I to all its digits, from Z = 2^ITERATIONS R, the columns of F, of G, and A; see
+    ``native/law_anisotropic.h``.
 
     R^T F is symmetric as far as R is converged, so that one half of it is enough for the rough strain.
     """

@@ -14,11 +14,10 @@ from typing import Any
 
 import warp as wp
 
-from warp_corot.kernels.elements.constitutive import IsotropicMaterial, corotated_strain, green_strain, hooke, symmetric
+from warp_corot.kernels.elements.constitutive import IsotropicMaterial
 from warp_corot.kernels.elements.elements import ForestElements, frame, local_gradient
-from warp_corot.kernels.elements.simd8 import headers, on_cpu
-from warp_corot.kernels.math.matrices import axial, identity3
-from warp_corot.kernels.math.rotation import byers_xu, identity3
+from warp_corot.kernels.elements.simd8 import headers, law_kernel, on_cpu
+from warp_corot.kernels.math.rotation import byers_xu
 from warp_corot.kernels.modules import unique_kernel
 from warp_corot.kernels.plan.plan import Plan, extent, leaf_row
 from warp_corot.kernels.stepping.pace import DT, Pace
@@ -41,102 +40,15 @@ class PronyMaterial:
     count: int
 
 
-@wp.func
-def deviator(a: wp.mat33):
-    return a - (wp.trace(a) / 3.0) * identity3()
-
-
-@wp.func
-def read_tensor(material: PronyMaterial, block: int, t: int):
-    first = 6 * block * material.count + t
-    n = material.count
-    xx = material.known[first]
-    yy = material.known[first + n]
-    zz = material.known[first + 2 * n]
-    xy = material.known[first + 3 * n]
-    xz = material.known[first + 4 * n]
-    yz = material.known[first + 5 * n]
-    return wp.mat33(xx, xy, xz, xy, yy, yz, xz, yz, zz)
-
-
-@wp.func
-def write_tensor(material: PronyMaterial, block: int, t: int, a: wp.mat33):
-    first = 6 * block * material.count + t
-    n = material.count
-    material.known[first] = a[0, 0]
-    material.known[first + n] = a[1, 1]
-    material.known[first + 2 * n] = a[2, 2]
-    material.known[first + 3 * n] = a[0, 1]
-    material.known[first + 4 * n] = a[0, 2]
-    material.known[first + 5 * n] = a[1, 2]
-
-
-@wp.func
-def fading(time: float, tau: float):
-    """exp(-t / tau) and phi, to all their digits, also for an infinite time."""
-    x = time / tau
-    left = wp.exp(-x)
-    mean = 1.0 - 0.5 * x * (1.0 - x / 3.0 * (1.0 - 0.25 * x))
-    if x > 0.02:
-        mean = (1.0 - left) / x
-    return left, mean
-
-
-@wp.func
-def rest_gradient(elements: Any, t: int, u: wp.array[wp.vec4]):
-    """du/dX in the axes of rest space."""
-    return local_gradient(elements, t, u) * wp.transpose(frame(elements, t))
-
-
-@wp.func
-def second_stress(material: PronyMaterial, t: int, strain: wp.mat33):
-    """The second Piola-Kirchhoff stress of all terms, of E."""
-    change = strain - read_tensor(material, 0, t)
-    s = wp.mat33()
-    for i in range(material.g.shape[0]):
-        left, mean = fading(material.elapsed[0], material.tau[i])
-        s += material.g[i] * (left * read_tensor(material, i + 1, t) + mean * change)
-    return (2.0 * material.isotropic.mu[t * material.isotropic.stride]) * s
-
-
-@wp.func
-def prony_stress(elements: Any, t: int, material: PronyMaterial, u: wp.array[wp.vec4]):
-    a = rest_gradient(elements, t, u)
-    s = second_stress(material, t, deviator(green_strain(a)))
-    return (s + a * s) * frame(elements, t)
-
-
-@wp.func
-def prony_differential(elements: Any, t: int, material: PronyMaterial, u: wp.array[wp.vec4], dg: wp.mat33):
-    a = rest_gradient(elements, t, u)
-    da = dg * wp.transpose(frame(elements, t))
-    s = second_stress(material, t, deviator(green_strain(a)))
-    d_strain = deviator(symmetric(da + wp.transpose(a) * da))
-    stiffness = float(0.0)
-    for i in range(material.g.shape[0]):
-        _left, mean = fading(material.elapsed[0], material.tau[i])
-        stiffness += material.g[i] * mean
-    d_s = (2.0 * stiffness * material.isotropic.mu[t * material.isotropic.stride]) * d_strain
-    return (da * s + d_s + a * d_s) * frame(elements, t)
-
-
-@wp.func
-def prony_density(elements: Any, t: int, material: PronyMaterial, u: wp.array[wp.vec4]):
-    change = deviator(green_strain(rest_gradient(elements, t, u))) - read_tensor(material, 0, t)
-    density = float(0.0)
-    for i in range(material.g.shape[0]):
-        left, mean = fading(material.elapsed[0], material.tau[i])
-        s = read_tensor(material, i + 1, t)
-        own = mean * wp.ddot(change, change) + left * (2.0 * wp.ddot(s, change) + wp.ddot(s, s))
-        density += material.g[i] * own
-    return density * material.isotropic.mu[t * material.isotropic.stride]
+@wp.func_native("corot::relax_at(material, t, g, q, time);")
+def relax_element(t: int, g: wp.mat33, q: wp.mat33, time: float, material: PronyMaterial): ...
 
 
 @functools.cache
 def relax(Elements: type) -> wp.Kernel:
     """Make the state at displacements u, after a step of the clock's length, the known one."""
 
-    @unique_kernel()
+    @law_kernel()
     def relax(
         # In
         elements: Elements,
@@ -146,13 +58,7 @@ def relax(Elements: type) -> wp.Kernel:
         material: PronyMaterial,
     ):
         t = wp.tid()
-        strain = deviator(green_strain(rest_gradient(elements, t, u)))
-        change = strain - read_tensor(material, 0, t)
-        time = float(pace.seconds[DT])
-        for i in range(material.g.shape[0]):
-            left, mean = fading(time, material.tau[i])
-            write_tensor(material, i + 1, t, left * read_tensor(material, i + 1, t) + mean * change)
-        write_tensor(material, 0, t, strain)
+        relax_element(t, local_gradient(elements, t, u), frame(elements, t), float(pace.seconds[DT]), material)
         if t == 0:
             material.elapsed[0] = 0.0
 
@@ -272,23 +178,6 @@ class Prestress:
     stride: int
 
 
-@wp.func
-def prestress_stress(elements: Any, t: int, material: Prestress, u: wp.array[wp.vec4]):
-    s = material.stress[t * material.stride]
-    return (s + rest_gradient(elements, t, u) * s) * frame(elements, t)
-
-
-@wp.func
-def prestress_differential(elements: Any, t: int, material: Prestress, u: wp.array[wp.vec4], dg: wp.mat33):
-    q = frame(elements, t)
-    return dg * wp.transpose(q) * material.stress[t * material.stride] * q
-
-
-@wp.func
-def prestress_density(elements: Any, t: int, material: Prestress, u: wp.array[wp.vec4]):
-    return wp.ddot(material.stress[t * material.stride], green_strain(rest_gradient(elements, t, u)))
-
-
 # --- viscosity -------------------------------------------------------------------------------------------------------
 #
 # Viscous forces: a stress proportional to the rate at which an element's stretch changes, however it turns.
@@ -298,11 +187,10 @@ def prestress_density(elements: Any, t: int, material: Prestress, u: wp.array[wp
 # whole, at any strain. The stress s = eta (2 mu Udot + lambda tr(Udot) I) works against Udot; the force that does the
 # same work at the nodes is that of P = R (s + [a]x), with (tr(U) I - U) a the axial vector of U s - s U: it takes out
 # s : Udot >= 0 of power and has no torque.
-
-#: Below this determinant of tr(U) I - U, which is 8 at rest, the turning of a crushed or inverted element is hardly
-#: determined. With stretches a > 0 > b it is (a - b) / (a + b) times Udot and so faster than the nodes, which no
-#: explicit step survives. Below, the symmetric part of A stands for Udot, which still takes power out.
-LEAST = wp.constant(0.05)
+#
+# Below a determinant of 0.05 of tr(U) I - U, which is 8 at rest, the turning of a crushed or inverted element is hardly
+# determined. With stretches a > 0 > b it is (a - b) / (a + b) times Udot and so faster than the nodes, which no
+# explicit step survives. Below, the symmetric part of A stands for Udot, which still takes power out.
 
 
 @wp.struct
@@ -314,27 +202,18 @@ class ViscousMaterial:
     velocities: wp.array[wp.vec4]
 
 
-@wp.func
-def viscous_stress(u: wp.mat33, a: wp.mat33, mu: float, lam: float):
-    """R^T P of a stretch U, a rate A and viscosities [Pa s]."""
-    m = wp.trace(u) * identity3() - u
-    if wp.determinant(m) < LEAST or wp.determinant(u) < 0.0:
-        return hooke(symmetric(a), mu, lam)
-    inverse = wp.inverse(m)
-    rate = symmetric(a - wp.skew(inverse * axial(a)) * u)
-    s = hooke(rate, mu, lam)
-    return s + wp.skew(inverse * axial(u * s))
+@wp.func_native("return corot::viscous_at(f, r, rate, mu, lam);")
+def viscous_stress(f: wp.mat33, r: wp.mat33, rate: wp.mat33, mu: float, lam: float) -> wp.mat33:
+    """P Q of F Q, its rotation, its rate and viscosities [Pa s]."""
+    ...
 
 
 @wp.func
 def viscosity_stress(elements: Any, t: int, material: ViscousMaterial, u: wp.array[wp.vec4]):
     """The viscous stress of element t for the kernels of ``forces``; forces are the stiffness times seconds times
     velocities, for small motions."""
-    g = local_gradient(elements, t, u)
-    q = frame(elements, t)
-    r = byers_xu(q + g)
-    stretch = identity3() + corotated_strain(g, q, r)
-    rate = wp.transpose(r) * local_gradient(elements, t, material.velocities)
-    eta = material.seconds
+    f = frame(elements, t) + local_gradient(elements, t, u)
+    rate = local_gradient(elements, t, material.velocities)
     i = t * material.isotropic.stride
-    return r * viscous_stress(stretch, rate, eta * material.isotropic.mu[i], eta * material.isotropic.lam[i])
+    m = material.seconds * material.isotropic.mu[i]
+    return viscous_stress(f, byers_xu(f), rate, m, material.seconds * material.isotropic.lam[i])

@@ -7,12 +7,12 @@ lambda and volume, and the energy
     W = sum over e of lambda_e V_e w(theta),  theta = sum of lambda_e V_e theta_e / sum of lambda_e V_e.
 
 This alone would let an element of a group turn over while others grow, as elements of crushed tissue do. So where
-theta_e is J - 1, W also has lambda_e V_e h(theta_e) for each element. h is zero up to |theta| = ``FREE``; from there on
-h'' grows from 0 to 1 over ``RAMP``. Forces are exact derivatives: P_e = lambda_e (w'(theta) + h'(theta_e)) d theta_e /
+theta_e is J - 1, W also has lambda_e V_e h(theta_e) for each element. h is zero up to |theta| = 0.25; from there on
+h'' grows from 0 to 1 over 0.5. Forces are exact derivatives: P_e = lambda_e (w'(theta) + h'(theta_e)) d theta_e /
 dF.
 
-Functions here take the displacement gradient A as ``constitutive`` has it. The kernels are in ``dilatation``,
-those of subtrees' forces in ``subtrees.forces``.
+Functions here are those of ``native/dilatation.h`` and take the displacement gradient A as ``constitutive`` has it. The
+kernels of subtrees' forces are in ``subtrees.forces``.
 """
 
 import functools
@@ -20,14 +20,7 @@ from typing import Any, NamedTuple
 
 import warp as wp
 
-from warp_corot.kernels.elements.constitutive import (
-    IsotropicMaterial,
-    dilation,
-    green_strain,
-    volumetric_curvature,
-    volumetric_energy,
-    volumetric_slope,
-)
+from warp_corot.kernels.elements.constitutive import IsotropicMaterial
 from warp_corot.kernels.elements.elements import add_nodal_forces, rest_volume
 from warp_corot.kernels.elements.forces import (
     element_energies,
@@ -36,17 +29,12 @@ from warp_corot.kernels.elements.forces import (
     scatter_forces,
     to_own_frame,
 )
-from warp_corot.kernels.math.matrices import cofactor_differential
-from warp_corot.kernels.math.rotation import cofactor, identity3
-from warp_corot.kernels.modules import Family, unique_kernel
+from warp_corot.kernels.elements.simd8 import LAW_HEADERS, law_kernel
+from warp_corot.kernels.modules import Family
 
 wp.set_module_options({"enable_backward": False})
 
 
-#: |J - 1| of an element up to which it is free to differ from its group's.
-FREE = wp.constant(0.25)
-#: Beyond that, the range of |J - 1| over which its stiffness grows to lambda.
-RAMP = wp.constant(0.5)
 #: Maximum number of elements in a group: three left of each of the six roots of a cube.
 MOST = 18
 
@@ -55,7 +43,7 @@ class Dilatation(NamedTuple):
     """The functions (device code) that stand for lambda times half the square of a trace in a law.
 
     Attributes:
-        lanes: The struct of ``native/dilatation.h`` that has them for lanes.
+        lanes: The struct of ``native/dilatation.h`` that has them.
         measure: theta and d theta / dF of A.
         turning: The differential of d theta / dF at A in a direction dA.
         energy, slope, curvature: w and its derivatives, of theta.
@@ -73,100 +61,50 @@ class Dilatation(NamedTuple):
     @property
     def key(self) -> str:
         """What names kernels, as functions' keys do."""
-        return self.lanes[-1]
+        return self.lanes
+
+    @property
+    def is_held(self) -> bool:
+        """Whether elements are held from turning over."""
+        return self.lanes in ("VolumeDilatation", "LogVolumeDilatation")
 
 
-@wp.func
-def small_dilatation(a: wp.mat33):
-    return wp.trace(a), identity3()
+def _dilatation(name: str) -> Dilatation:
+    of = f"corot::{name}"
+
+    @wp.func_native(f"return corot::theta_of<{of}>(a);")
+    def theta_of(a: wp.mat33) -> float: ...
+
+    @wp.func_native(f"return corot::slopes_of<{of}>(a);")
+    def slopes_of(a: wp.mat33) -> wp.mat33: ...
+
+    @wp.func
+    def measure(a: wp.mat33):
+        return theta_of(a), slopes_of(a)
+
+    @wp.func_native(f"return corot::turning_of<{of}>(a, da);")
+    def turning(a: wp.mat33, da: wp.mat33) -> wp.mat33: ...
+
+    @wp.func_native(f"return {of}::energy(theta);")
+    def energy(theta: float) -> float: ...
+
+    @wp.func_native(f"return {of}::pressure(theta);")
+    def slope(theta: float) -> float: ...
+
+    @wp.func_native(f"return {of}::pressure(corot::dual_of<float>(theta, 1.0f)).slope;")
+    def curvature(theta: float) -> float: ...
+
+    held = f"{of}::holding(corot::dual_of<float>(theta, 1.0f))"
+
+    @wp.func_native(f"const auto h = {held};\nreturn wp::vec3({of}::held_energy(theta), h.value, h.slope);")
+    def holding(theta: float) -> wp.vec3: ...
+
+    return Dilatation(name, measure, turning, energy, slope, curvature, holding)
 
 
-@wp.func
-def small_turning(a: wp.mat33, da: wp.mat33):
-    return wp.mat33()
-
-
-@wp.func
-def green_dilatation(a: wp.mat33):
-    return wp.trace(green_strain(a)), identity3() + a
-
-
-@wp.func
-def green_turning(a: wp.mat33, da: wp.mat33):
-    return da
-
-
-@wp.func
-def volume_dilatation(a: wp.mat33):
-    """J - 1, and cof F = I + tr(A) I - A^T + cof A."""
-    cof = cofactor(a)
-    return dilation(a, cof), cof - wp.transpose(a) + (1.0 + wp.trace(a)) * identity3()
-
-
-@wp.func
-def volume_turning(a: wp.mat33, da: wp.mat33):
-    return cofactor_differential(a, da) - wp.transpose(da) + wp.trace(da) * identity3()
-
-
-@wp.func
-def square_energy(theta: float):
-    return 0.5 * theta * theta
-
-
-@wp.func
-def square_slope(theta: float):
-    return theta
-
-
-@wp.func
-def square_curvature(theta: float):
-    return 1.0
-
-
-@wp.func
-def log_energy(theta: float):
-    """Half of (ln J)^2, continued where J is small as neo-Hookean's."""
-    return volumetric_energy(theta, 0.0, 1.0)
-
-
-@wp.func
-def log_slope(theta: float):
-    return volumetric_slope(theta, 0.0, 1.0)
-
-
-@wp.func
-def log_curvature(theta: float):
-    return volumetric_curvature(theta, 0.0, 1.0)
-
-
-@wp.func
-def held(theta: float):
-    beyond = wp.max(wp.abs(theta) - FREE, 0.0)
-    near = wp.min(beyond, RAMP)
-    far = beyond - near
-    slope = 0.5 * near * near / RAMP
-    energy = near * slope / 3.0 + far * (slope + 0.5 * far)
-    return wp.vec3(energy, wp.sign(theta) * (slope + far), near / RAMP)
-
-
-@wp.func
-def not_held(theta: float):
-    return wp.vec3()
-
-
-_SQUARE = (square_energy, square_slope, square_curvature)
 #: tr e of linear elasticity, tr E of St. Venant-Kirchhoff, J - 1 of corotated and, in the logarithm, of neo-Hookean.
-SMALL = Dilatation("SmallDilatation", small_dilatation, small_turning, *_SQUARE, not_held)
-GREEN = Dilatation("GreenDilatation", green_dilatation, green_turning, *_SQUARE, not_held)
-VOLUME = Dilatation("VolumeDilatation", volume_dilatation, volume_turning, *_SQUARE, held)
-LOG_VOLUME = Dilatation(
-    "LogVolumeDilatation",
-    volume_dilatation,
-    volume_turning,
-    log_energy,
-    log_slope,
-    log_curvature,
-    held,
+SMALL, GREEN, VOLUME, LOG_VOLUME = (
+    _dilatation(f"{name}Dilatation") for name in ("Small", "Green", "Volume", "LogVolume")
 )
 
 
@@ -203,7 +141,7 @@ def pressure_stress_of(of: Dilatation) -> wp.Function:
 #
 # Launches may be larger than the mesh: ``live`` has the current number of elements; without it, all count.
 
-OF_ELEMENTS = Family(__name__)
+OF_ELEMENTS = Family(__name__, LAW_HEADERS)
 
 
 @wp.func
@@ -295,7 +233,7 @@ def range_of(starts: wp.array[wp.int32], members: wp.array[wp.int32], g: int):
 def share_in_groups(Elements: type, law: wp.Function) -> wp.Kernel:
     """A thread a group; see ``range_of`` for what a group is."""
 
-    @unique_kernel()
+    @law_kernel()
     def share_in_groups(
         # In
         starts: wp.array[wp.int32],

@@ -18,9 +18,7 @@ def stresses(law: IsotropicLaw) -> wp.Kernel:
     """P of displacement gradients A and its differential in a direction dA; and whether the law holds there, which
     without a definite rotation the corotated one does not."""
     native = bare(law)
-    # Ogden's law has eigenvalues to float32's digits and no differential.
-    change, into = ("", "") if isinstance(law, tuple) else ("da.data[i], ", ", dp.data[i]")
-    call = f"corot::stress_of({native.code}, a.data[i], {change}mu.data[i], lam.data[i], p.data[i]{into})"
+    call = f"corot::stress_of({native.code}, a.data[i], da.data[i], mu.data[i], lam.data[i], p.data[i], dp.data[i])"
 
     @wp.func_native(on_cpu(f"return {call};", otherwise="return false;\n"))
     def stress(
@@ -33,7 +31,7 @@ def stresses(law: IsotropicLaw) -> wp.Kernel:
         dp: wp.array[wp.mat33d],
     ) -> bool: ...
 
-    @unique_kernel(native=headers("float64"))
+    @unique_kernel(native=headers("single"))
     def stresses(
         # In
         a: wp.array[wp.mat33d],
@@ -66,7 +64,7 @@ def dilatations(of: Dilatation) -> wp.Kernel:
         turning: wp.array[wp.mat33d],
     ): ...
 
-    @unique_kernel(native=headers("float64"))
+    @unique_kernel(native=headers("single"))
     def dilatations(
         # In
         a: wp.array[wp.mat33d],
@@ -90,7 +88,7 @@ def pressures(of: Dilatation) -> wp.Kernel:
     @wp.func_native(on_cpu(f"{code}{pair}(w.value, w.slope);", otherwise=f"{pair}();\n"))
     def pressure(theta: wp.float64) -> wp.vec2d: ...
 
-    @unique_kernel(native=headers("float64"))
+    @unique_kernel(native=headers("single"))
     def pressures(theta: wp.array[wp.float64], found: wp.array[wp.vec2d]):
         i = wp.tid()
         found[i] = pressure(theta[i])

@@ -8,7 +8,7 @@ the law reads; ``kernel`` is the decorator, of a ``Family`` if there is one.
 
 import functools
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import warp as wp
 
@@ -23,7 +23,8 @@ from warp_corot.kernels.elements.elements import (
     rest_volume,
     scatter_stress,
 )
-from warp_corot.kernels.modules import unique_kernel
+from warp_corot.kernels.elements.simd8 import law_kernel
+from warp_corot.kernels.math.matrices import identity3
 
 wp.set_module_options({"enable_backward": False})
 
@@ -89,7 +90,7 @@ def law_cauchy(stress: wp.Function) -> wp.Function:
     def law_cauchy(elements: Any, t: int, material: IsotropicMaterial, u: wp.array[wp.vec4]):
         i = t * material.stride
         a = own_gradient(elements, t, u)
-        return push_forward(a, stress(a, material.mu[i], material.lam[i]))
+        return push_forward(identity3() + a, stress(a, material.mu[i], material.lam[i]))
 
     return law_cauchy
 
@@ -106,11 +107,56 @@ def law_value(function: wp.Function) -> wp.Function:
     return law_value
 
 
+# --- laws of ``native`` with their material --------------------------------------------------------------------------
+
+
+class ElementLaw(NamedTuple):
+    """A law's stress, its differential and its energy density for the kernels below, and its stress at a displacement
+    gradient in the axes of rest space: (t, A, material) -> P.
+    """
+
+    stress: wp.Function
+    differential: wp.Function
+    density: wp.Function
+    in_rest_axes: wp.Function
+
+
+@functools.cache
+def element_law(law: str, Material: type) -> ElementLaw:
+    """The functions of a law in C++, whose ``material`` is a struct of this type."""
+
+    @wp.func_native(f"return corot::stress_at({law}, t, g, corot::frame_of(q));")
+    def stress_at(t: int, g: wp.mat33, q: wp.mat33, material: Material) -> wp.mat33: ...
+
+    @wp.func_native(f"return corot::differential_at({law}, t, g, q, dg);")
+    def differential_at(t: int, g: wp.mat33, q: wp.mat33, dg: wp.mat33, material: Material) -> wp.mat33: ...
+
+    @wp.func_native(f"return corot::energy_at({law}, t, g, q);")
+    def energy_at(t: int, g: wp.mat33, q: wp.mat33, material: Material) -> float: ...
+
+    @wp.func_native(f"return corot::stress_at({law}, t, a, corot::RestAxes<float>());")
+    def in_rest_axes(t: int, a: wp.mat33, material: Material) -> wp.mat33: ...
+
+    @wp.func
+    def element_stress(elements: Any, t: int, material: Material, u: wp.array[wp.vec4]):
+        return stress_at(t, local_gradient(elements, t, u), frame(elements, t), material)
+
+    @wp.func
+    def element_differential(elements: Any, t: int, material: Material, u: wp.array[wp.vec4], dg: wp.mat33):
+        return differential_at(t, local_gradient(elements, t, u), frame(elements, t), dg, material)
+
+    @wp.func
+    def element_density(elements: Any, t: int, material: Material, u: wp.array[wp.vec4]):
+        return energy_at(t, local_gradient(elements, t, u), frame(elements, t), material)
+
+    return ElementLaw(element_stress, element_differential, element_density, in_rest_axes)
+
+
 # --- kernels of any law on any kind of elements -----------------------------------------------------------------------
 
 
 @functools.cache
-def scatter_forces(Elements: type, Material: type, stress: wp.Function, kernel: Callable = unique_kernel) -> wp.Kernel:
+def scatter_forces(Elements: type, Material: type, stress: wp.Function, kernel: Callable = law_kernel) -> wp.Kernel:
     """Add the elastic nodal forces of a law to f; a thread an element."""
 
     @kernel()
@@ -132,7 +178,7 @@ def scatter_forces(Elements: type, Material: type, stress: wp.Function, kernel: 
 def repair_forces(Elements: type, Material: type, stress: wp.Function) -> wp.Kernel:
     """The same for the elements on a list (their number, then their indices), by one thread, which empties the list."""
 
-    @unique_kernel()
+    @law_kernel()
     def repair_forces(
         # In
         elements: Elements,
@@ -153,7 +199,7 @@ def repair_forces(Elements: type, Material: type, stress: wp.Function) -> wp.Ker
 
 @functools.cache
 def element_energies(
-    Elements: type, Material: type, density: wp.Function, kernel: Callable = unique_kernel, adds: bool = False
+    Elements: type, Material: type, density: wp.Function, kernel: Callable = law_kernel, adds: bool = False
 ) -> wp.Kernel:
     """Strain energy of each element [J], in float64 so that sums over millions keep their digits; or add it to a known
     one.
@@ -178,9 +224,7 @@ def element_energies(
 
 
 @functools.cache
-def element_von_mises(
-    Elements: type, Material: type, cauchy: wp.Function, kernel: Callable = unique_kernel
-) -> wp.Kernel:
+def element_von_mises(Elements: type, Material: type, cauchy: wp.Function, kernel: Callable = law_kernel) -> wp.Kernel:
     """Von Mises stress of each element [Pa]."""
 
     @kernel()
@@ -226,7 +270,7 @@ def law_differential(law: wp.Function) -> wp.Function:
 def add_stiffness_product(Elements: type, Material: type, differential: wp.Function) -> wp.Kernel:
     """y += K(u) p; a thread an element."""
 
-    @unique_kernel()
+    @law_kernel()
     def add_stiffness_product(
         # In
         elements: Elements,
@@ -252,7 +296,7 @@ def where_is(chosen: bool, v: wp.vec3):
 def add_stiffness_diagonal(Elements: type, Material: type, differential: wp.Function) -> wp.Kernel:
     """Add the 3x3 blocks on K(u)'s diagonal to those of the nodes; a thread a node of an element."""
 
-    @unique_kernel()
+    @law_kernel()
     def add_stiffness_diagonal(
         # In
         elements: Elements,

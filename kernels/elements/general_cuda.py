@@ -5,14 +5,10 @@ neighbouring numbers, and neighbouring elements' forces are added up before they
 the fastest.
 """
 
-import functools
-
 import warp as wp
 
-from warp_corot.kernels.corotated.algebraic import corotated_stress
-from warp_corot.kernels.math.rotation import column, identity3, quick_rotation
+from warp_corot.kernels.math.matrices import column
 
-from .constitutive import corotated_strain, hooke, stretch_strain
 from .elements import add_four_forces, load_node
 
 wp.set_module_options({"enable_backward": False})
@@ -66,20 +62,3 @@ def add_stress(elements: PosedElements, t: int, nodes: wp.vec4i, p: wp.mat33, f:
     h = (-elements.volume[t]) * p * wp.transpose(rest_inverse_of(elements, t))
     f1, f2, f3 = column(h, 0), column(h, 1), column(h, 2)
     add_forces(f, nodes, -(f1 + f2 + f3), f1, f2, f3)
-
-
-@functools.cache
-def corotated_law(rotation: wp.Function) -> wp.Function:
-    """The corotated stress of each element's own rotation, as a law of its displacement gradient.
-
-    For ``quick_rotation`` it is found without the rotation.
-    """
-    if rotation is quick_rotation:
-        return corotated_stress
-
-    @wp.func
-    def stress_of_rotation(a: wp.mat33, mu: float, lam: float):
-        r = rotation(identity3() + a)
-        return r * hooke(stretch_strain(corotated_strain(a, identity3(), r), a), mu, lam)
-
-    return stress_of_rotation

@@ -14,10 +14,11 @@ from .constitutive import IsotropicMaterial
 from .dilatation import Dilatation, is_live, mean_of, place_of, range_of, scatter
 from .elements import nodal_forces, rest_volume
 from .forces import in_local_frame, own_gradient
+from .simd8 import LAW_HEADERS
 
 wp.set_module_options({"enable_backward": False})
 
-OF_GROUPS = Family(__name__)
+OF_GROUPS = Family(__name__, LAW_HEADERS)
 
 #: Threads that share a group on CUDA.
 THREADS = 8

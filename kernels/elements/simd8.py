@@ -18,7 +18,6 @@ from typing import NamedTuple
 
 import warp as wp
 
-from warp_corot.kernels.elements.ogden import part_of_volume, stretch_limits
 from warp_corot.kernels.modules import unique_kernel
 
 LANES = 8
@@ -33,12 +32,13 @@ def native(name: str) -> str:
 
 
 @functools.cache
-def headers(*names: str, types: str = "") -> wp.ModuleBuildOptions:
+def headers(*names: str, types: str = "", cuda: bool = False) -> wp.ModuleBuildOptions:
     """Options of a module for the CPU that includes headers, and compiles again if one of them has changed.
 
     Args:
         names: The headers.
         types: C++ that follows them.
+        cuda: Whether the module includes them on CUDA, too.
     """
     found = {NATIVE / f"{name}.h": None for name in names}
     includes = "".join(f'#include "{path.as_posix()}"\n' for path in found)
@@ -47,7 +47,17 @@ def headers(*names: str, types: str = "") -> wp.ModuleBuildOptions:
             if NATIVE / name not in found:
                 found[NATIVE / name] = None
                 waiting.append(NATIVE / name)
-    return wp.ModuleBuildOptions(extra_cpu_preamble=includes + types, extra_build_dependencies=list(found))
+    return wp.ModuleBuildOptions(
+        extra_cpu_preamble=includes + types,
+        extra_cuda_preamble=includes if cuda else "",
+        extra_build_dependencies=list(found),
+    )
+
+
+#: What modules of kernels that call laws of single elements include.
+LAW_HEADERS = headers("single", cuda=True)
+#: The decorator of such kernels.
+law_kernel = functools.partial(unique_kernel, native=LAW_HEADERS)
 
 
 def constants(**values: float) -> str:
@@ -135,6 +145,22 @@ STRESSLESS = "stressless"
 
 #: An isotropic law: a name, or the terms (share, alpha) of Ogden's.
 IsotropicLaw = str | tuple[tuple[float, float], ...]
+
+
+#: A term of Ogden's law continues as a parabola where it would be this many times as stiff as at rest.
+STIFFENING = 1000.0
+
+
+def stretch_limits(alpha: float) -> tuple[float, float]:
+    """Smallest and largest principal stretch at which a term with this exponent is the plain law."""
+    low = STIFFENING ** (-1.0 / (2.0 - alpha)) if alpha < 0.0 else 0.5 if alpha < 2.0 else 0.01
+    high = STIFFENING ** (1.0 / max(alpha - 2.0, 1.0))
+    return low, high
+
+
+def part_of_volume(share: float, alpha: float) -> float:
+    """v_p of a term, see ``native/law_ogden.h``."""
+    return 2.0 * share / alpha if alpha > 0.0 else share
 
 
 def bare(law: IsotropicLaw) -> NativeLaw:

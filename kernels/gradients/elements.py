@@ -18,8 +18,8 @@ from warp_corot.kernels.elements.constitutive import IsotropicMaterial
 from warp_corot.kernels.elements.dilatation import Dilatation
 from warp_corot.kernels.elements.elements import frame, local_gradient, rest_volume, scatter_stress
 from warp_corot.kernels.elements.forces import in_local_frame, own_gradient
+from warp_corot.kernels.elements.simd8 import law_kernel
 from warp_corot.kernels.math.rotation import column, identity3
-from warp_corot.kernels.modules import unique_kernel
 
 wp.set_module_options({"enable_backward": False})
 
@@ -28,7 +28,7 @@ wp.set_module_options({"enable_backward": False})
 def add_stress_work(Elements: type, Material: type, stress: wp.Function) -> wp.Kernel:
     """Add each element's work, times a scale [J]."""
 
-    @unique_kernel()
+    @law_kernel()
     def add_stress_work(
         # In
         elements: Elements,
@@ -50,7 +50,7 @@ def add_stress_work(Elements: type, Material: type, stress: wp.Function) -> wp.K
 def add_rest_work(Elements: type, Material: type, stress: wp.Function, differential: wp.Function) -> wp.Kernel:
     """Add the derivative of the work with respect to the nodes' rest positions [N]."""
 
-    @unique_kernel()
+    @law_kernel()
     def add_rest_work(
         # In
         elements: Elements,
@@ -78,7 +78,7 @@ def add_rest_weight(Elements: type) -> wp.Kernel:
     times its volume.
     """
 
-    @unique_kernel()
+    @law_kernel()
     def add_rest_weight(
         # In
         elements: Elements,
@@ -105,7 +105,7 @@ def add_dilatation_work(Elements: type, of: Dilatation) -> wp.Kernel:
     """Add the derivative with respect to each element's lambda, times a scale."""
     measure, holding = of.measure, of.holding
 
-    @unique_kernel()
+    @law_kernel()
     def add_dilatation_work(
         # In
         elements: Elements,
@@ -130,7 +130,7 @@ def add_dilatation_rest_work(Elements: type, of: Dilatation) -> wp.Kernel:
     """Add the derivative with respect to the nodes' rest positions [N]."""
     measure, turning, holding = of.measure, of.turning, of.holding
 
-    @unique_kernel()
+    @law_kernel()
     def add_dilatation_rest_work(
         # In
         elements: Elements,
@@ -165,7 +165,7 @@ def add_dilatation_rest_work(Elements: type, of: Dilatation) -> wp.Kernel:
 def add_fibre_work(Elements: type) -> wp.Kernel:
     """Add the derivative with respect to each element's active stress, times a scale: of P = s (F d) d^T."""
 
-    @unique_kernel()
+    @law_kernel()
     def add_fibre_work(
         # In
         elements: Elements,

@@ -69,22 +69,6 @@ def cofactor(a: wp.mat33):
 
 
 @wp.func
-def cofactor_differential(a: wp.mat33, da: wp.mat33):
-    """The derivative of ``cofactor`` at A in the direction dA."""
-    a0 = column(a, 0)
-    a1 = column(a, 1)
-    a2 = column(a, 2)
-    d0 = column(da, 0)
-    d1 = column(da, 1)
-    d2 = column(da, 2)
-    return wp.matrix_from_cols(
-        wp.cross(a1, d2) + wp.cross(d1, a2),
-        wp.cross(a2, d0) + wp.cross(d2, a0),
-        wp.cross(a0, d1) + wp.cross(d0, a1),
-    )
-
-
-@wp.func
 def axial(a: wp.mat33):
     """The vector w with [w]x = A - A^T."""
     return wp.vec3(a[2, 1] - a[1, 2], a[0, 2] - a[2, 0], a[1, 0] - a[0, 1])

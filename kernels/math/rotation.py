@@ -10,7 +10,11 @@ Newton's iteration has no result for a singular F and gives a reflection for an 
 ``quaternion.robust_rotation`` is used.
 """
 
+import functools
+
 import warp as wp
+
+from warp_corot.kernels.modules import unique_kernel
 
 from .matrices import all_finite, cofactor, column, frobenius, identity3, largest_entry, reciprocal
 from .quaternion import robust_rotation
@@ -184,3 +188,15 @@ def byers_xu_fixed(iterations: int) -> wp.Function:
         return r
 
     return byers_xu_unrolled
+
+
+@functools.cache
+def rotate_all(rotation: wp.Function) -> wp.Kernel:
+    """Rotations of arrays of matrices."""
+
+    @unique_kernel()
+    def rotate_all(matrices: wp.array[wp.mat33], rotations: wp.array[wp.mat33]):
+        i = wp.tid()
+        rotations[i] = rotation(matrices[i])
+
+    return rotate_all

@@ -1,5 +1,5 @@
-// Stresses beside a law: viscosity (elements/viscosity.py), the Maxwell elements of a Prony series (elements/prony.py), and
-// one that a body has at rest (elements/prestress.py).
+// Stresses beside a law: viscosity, the Maxwell elements of a Prony series, and one that a body has at rest; see
+// elements/added.py.
 #pragma once
 
 #include "elements8.h"
@@ -22,7 +22,7 @@ COROT_INLINE void viscous_stress(const triple<S>* f, const triple<S>* r, const t
     const triple<S> adjugate[3] = {cross(turn[1], turn[2]), cross(turn[2], turn[0]), cross(turn[0], turn[1])};
     const S det = dot(turn[0], adjugate[0]);
     const mask_of<S> crushed = (det < LEAST_TURNING) | (dot(u[0], cross(u[1], u[2])) < 0.0f);
-    const S inverse = crushed ? spread<S>(0.0f) : 1.0f / det;
+    const S inverse = crushed ? spread<S>(0.0f) : over(1.0f, det);
     const auto solve = [&](const triple<S>& x) {
         return triple<S>{dot(adjugate[0], x) * inverse, dot(adjugate[1], x) * inverse, dot(adjugate[2], x) * inverse};
     };
@@ -44,6 +44,7 @@ COROT_INLINE void viscous_stress(const triple<S>* f, const triple<S>* r, const t
     for (int j = 0; j < 3; ++j) p[j] = combined(s[j].x, r[0], s[j].y, r[1], s[j].z, r[2]);
 }
 
+#if !defined(__CUDACC__)
 // The viscous stress of a ``ViscousMaterial``.
 template <class Material> struct Viscous {
     const Material& material;
@@ -63,12 +64,14 @@ template <class Material> struct Viscous {
 };
 
 template <class Material> COROT_INLINE Viscous<Material> viscous(const Material& material) { return {material, {}}; }
+#endif
 
 // The Maxwell elements of a ``PronyMaterial``.
 template <class Material> struct Prony {
     const Material& material;
     template <class Nodes> COROT_INLINE void begin(const Nodes&) {}
 
+    // The numbers of an element, or of eight, one after the other from ``known``.
     COROT_INLINE const float* known(int block, int i) const {
         return material.known.data + (6 * block + i) * static_cast<unsigned long long>(material.count);
     }
@@ -76,23 +79,23 @@ template <class Material> struct Prony {
     // exp(-t / tau) of a term, and the share of a change that is left.
     COROT_INLINE void fade(int term, float time, float& left, float& mean) const {
         const float x = time / material.tau.data[term];
-        left = __builtin_expf(-x);
+        left = power_of(-x);
         mean = x > 0.02f ? (1.0f - left) / x : 1.0f - 0.5f * x * (1.0f - x / 3.0f * (1.0f - 0.25f * x));
     }
 
     // The deviator of Green's strain in the axes of rest space, and its change since the known state.
-    template <class D, class At> COROT_INLINE void strain_of(const D& d, const At& at, lanes8* strain, lanes8* change) const {
-        lanes8 e[6];
-        const lanes8 mean = (d.e[0] + d.e[1] + d.e[2]) * (1.0f / 6);
+    template <class D, class At, class S = typename D::S> COROT_INLINE void strain_of(const D& d, const At& at, S* strain, S* change) const {
+        S e[6];
+        const S mean = (d.e[0] + d.e[1] + d.e[2]) * (1.0f / 6);
         for (int i = 0; i < 6; ++i) e[i] = i < 3 ? 0.5f * d.e[i] - mean : 0.5f * d.e[i];
         out_of_frame(d.frame, e, strain);
         for (int i = 0; i < 6; ++i) change[i] = strain[i] - at.values_of(known(0, i));
     }
 
-    template <class D, class At> COROT_INLINE masks8 stress(const D& d, const At& at, triple<lanes8>* p) const {
-        lanes8 strain[6], change[6], sum[6], second[6];
+    template <class D, class At, class S = typename D::S> COROT_INLINE mask_of<S> stress(const D& d, const At& at, triple<S>* p) const {
+        S strain[6], change[6], sum[6], second[6];
         strain_of(d, at, strain, change);
-        for (int i = 0; i < 6; ++i) sum[i] = spread<lanes8>(0.0f);
+        for (int i = 0; i < 6; ++i) sum[i] = spread<S>(0.0f);
         for (int term = 0; term < material.g.shape[0]; ++term) {
             float left, mean;
             fade(term, material.elapsed.data[0], left, mean);
@@ -100,27 +103,37 @@ template <class Material> struct Prony {
             for (int i = 0; i < 6; ++i) sum[i] += (g * left) * at.values_of(known(term + 1, i)) + (g * mean) * change[i];
         }
         into_frame(d.frame, sum, second);
-        const lanes8 twice = 2.0f * at.weight() * at.value(material.isotropic.mu, material.isotropic.stride);
-        for (int i = 0; i < 6; ++i) second[i] *= twice;
+        const auto twice = 2.0f * at.weight() * at.value(material.isotropic.mu, material.isotropic.stride);
+        for (int i = 0; i < 6; ++i) second[i] = second[i] * twice;
         times(d.f, second, p);
-        return every<lanes8>();
+        return every<S>();
     }
 
-    // Makes the state a time later, at a deformation of eight consecutive elements, the known one.
-    template <class D, class At> COROT_INLINE void relax(const D& d, const At& at, float time) const {
-        const auto keep = [&](int block, int i, const lanes8& values) {
-            float* const to = const_cast<float*>(known(block, i)) + at.first;
-            if (at.end == 8) return store8(to, values);
-            for (int lane = 0; lane < at.end; ++lane) to[lane] = values[lane];
-        };
-        lanes8 strain[6], change[6];
+    template <class D> COROT_INLINE float energy(const D& d, const Single& at) const {
+        float strain[6], change[6], sum = 0.0f;
+        strain_of(d, at, strain, change);
+        for (int term = 0; term < material.g.shape[0]; ++term) {
+            float left, mean, density = 0.0f;
+            fade(term, material.elapsed.data[0], left, mean);
+            for (int i = 0; i < 6; ++i) {
+                const float s = at.values_of(known(term + 1, i));
+                density += (i < 3 ? 1.0f : 2.0f) * (mean * change[i] * change[i] + left * s * (2.0f * change[i] + s));
+            }
+            sum += material.g.data[term] * density;
+        }
+        return sum * at.value(material.isotropic.mu, material.isotropic.stride);
+    }
+
+    // Makes the state a time later, at a deformation of an element or of eight consecutive ones, the known one.
+    template <class D, class At, class S = typename D::S> COROT_INLINE void relax(const D& d, const At& at, float time) const {
+        S strain[6], change[6];
         strain_of(d, at, strain, change);
         for (int term = 0; term < material.g.shape[0]; ++term) {
             float left, mean;
             fade(term, time, left, mean);
-            for (int i = 0; i < 6; ++i) keep(term + 1, i, left * at.values_of(known(term + 1, i)) + mean * change[i]);
+            for (int i = 0; i < 6; ++i) at.write(known(term + 1, i), left * at.values_of(known(term + 1, i)) + mean * change[i]);
         }
-        for (int i = 0; i < 6; ++i) keep(0, i, strain[i]);
+        for (int i = 0; i < 6; ++i) at.write(known(0, i), strain[i]);
     }
 };
 
@@ -128,14 +141,21 @@ template <class Material> struct Prony {
 template <class Material> struct Prestressed {
     const Material& material;
     template <class Nodes> COROT_INLINE void begin(const Nodes&) {}
-    template <class D, class At> COROT_INLINE masks8 stress(const D& d, const At& at, triple<lanes8>* p) const {
-        lanes8 s[9], turned[6];
-        gather_numbers<9>(at, [&](int t) { return material.stress.data[t].data[0]; }, material.stride, s);
-        const lanes8 six[6] = {s[0], s[4], s[8], s[1], s[2], s[5]};
+    template <class D, class At, class S = typename D::S> COROT_INLINE mask_of<S> stress(const D& d, const At& at, triple<S>* p) const {
+        typedef typename At::N N;
+        N s[9], turned[6];
+        gather_numbers<9>(at, [&](int t) { return &material.stress.data[t].data[0][0]; }, material.stride, s);
+        const N six[6] = {s[0], s[4], s[8], s[1], s[2], s[5]};
         into_frame(d.frame, six, turned);
         for (int i = 0; i < 6; ++i) turned[i] *= at.weight();
         times(d.f, turned, p);
-        return every<lanes8>();
+        return every<S>();
+    }
+    template <class D> COROT_INLINE float energy(const D& d, const Single& at) const {
+        float e[6], s[9];
+        out_of_frame(d.frame, d.e, e);
+        gather_numbers<9>(at, [&](int t) { return &material.stress.data[t].data[0][0]; }, material.stride, s);
+        return 0.5f * (s[0] * e[0] + s[4] * e[1] + s[8] * e[2]) + s[1] * e[3] + s[2] * e[4] + s[5] * e[5];
     }
 };
 
@@ -143,6 +163,7 @@ template <class Material> COROT_INLINE Prestressed<Material> prestressed(const M
 
 template <class Material> COROT_INLINE Prony<Material> prony(const Material& material) { return {material}; }
 
+#if !defined(__CUDACC__)
 template <template <class> class Traversal, class Material, class Units, class Vectors>
 COROT_INLINE void relax_eight(const Material& material, const Units& units, int block, int count, const Vectors& u, float time) {
     const Traversal<Units> at(units, 8 * block, count);
@@ -150,5 +171,6 @@ COROT_INLINE void relax_eight(const Material& material, const Units& units, int 
     gradient_of(at, u, a);
     prony(material).relax(deformation_of(a, at.frame), at, time);
 }
+#endif
 
 }  // namespace corot

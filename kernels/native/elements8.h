@@ -5,6 +5,7 @@
 
 #include "dilatation.h"
 
+#if !defined(__CUDACC__)
 namespace corot {
 
 // The columns of the gradient of nodal vectors times the edge length, and the forces at the four nodes of columns of a
@@ -54,6 +55,7 @@ template <class Units, class Code> COROT_INLINE lanes8 edge_of(const Units& unit
 // Eight elements from ``first`` on, or, if LISTABLE, of a list of them; those past the last of ``count`` are the last one
 // again.
 template <class Units_, bool LISTABLE> struct Eight {
+    typedef lanes8 N;
     const Units_& units;
     const int first, last, end;
     const bool is_row;
@@ -71,6 +73,11 @@ template <class Units_, bool LISTABLE> struct Eight {
     }
     template <class Values> COROT_INLINE lanes8 value(const Values& values, int stride) const {
         return stride ? values_of(values.data) : spread<lanes8>(values.data[0]);
+    }
+    COROT_INLINE void write(const float* values, const lanes8& a) const {
+        float* const to = const_cast<float*>(values) + first;
+        if (end == 8) return store8(to, a);
+        for (int lane = 0; lane < end; ++lane) to[lane] = a[lane];
     }
     COROT_INLINE masks8 done() const { return masks8{}; }
     // Vectors of the four nodes.
@@ -199,3 +206,4 @@ COROT_INLINE void scatter_posed(const Law& law, const Units& units, int block, i
 }
 
 }  // namespace corot
+#endif

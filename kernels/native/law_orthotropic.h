@@ -2,11 +2,22 @@
 #pragma once
 
 #include "elements8.h"
+#include "law_anisotropic.h"
 
 namespace corot {
 
 // (det(tr(S) I - S) / |S|^3)^2 times four, where leaves of no definite rotation begin: twice 0.41, squared.
 constexpr float NEARLY_INDEFINITE = 0.82f * 0.82f;
+
+// The columns of P of strains and rotations that are definite.
+COROT_INLINE void law_of(const lanes8* c, const lanes8* e, const triple<lanes8>* r, triple<lanes8>* p) {
+    lanes8 s[6];
+    orthotropic_stress(c, e, s);
+    const lanes8 h[3] = {2.0f + e[1] + e[2], 2.0f + e[0] + e[2], 2.0f + e[0] + e[1]};
+    lanes8 adjugate[6];
+    const lanes8 det = turning_adjugate(h, e, adjugate);
+    turned_columns(s, applied(adjugate, commutator(e, s)) * (1.0f / det), r, p);
+}
 
 // Forces of eight elements whose rest matrices are multiplied by the material's axes M, under a ``FibreMaterial``. Lists
 // those that have no definite rotation.
@@ -52,28 +63,7 @@ COROT_INLINE void scatter_orthotropic(const Units& units, int block, int count, 
         strain[4] = small ? strain[4] : 0.5f * (dot(other[0], c[2]) + dot(other[2], c[0]));
         strain[5] = small ? strain[5] : 0.5f * (dot(other[1], c[2]) + dot(other[2], c[1]));
     }
-    const lanes8 &e0 = strain[0], &e1 = strain[1], &e2 = strain[2];
-    const lanes8 &e01 = strain[3], &e02 = strain[4], &e12 = strain[5];
-    const lanes8 s0 = k[0] * e0 + k[3] * e1 + k[4] * e2;
-    const lanes8 s1 = k[3] * e0 + k[1] * e1 + k[5] * e2;
-    const lanes8 s2 = k[4] * e0 + k[5] * e1 + k[2] * e2;
-    const lanes8 s01 = 2.0f * k[6] * e01, s02 = 2.0f * k[7] * e02, s12 = 2.0f * k[8] * e12;
-    // tr(S) I - S has the diagonal h and the other entries -e; its adjugate and determinant.
-    const lanes8 h0 = 2.0f + e1 + e2, h1 = 2.0f + e0 + e2, h2 = 2.0f + e0 + e1;
-    const lanes8 a0 = h1 * h2 - e12 * e12, a1 = h0 * h2 - e02 * e02, a2 = h0 * h1 - e01 * e01;
-    const lanes8 a01 = e02 * e12 + e01 * h2, a02 = e01 * e12 + e02 * h1, a12 = e01 * e02 + h0 * e12;
-    const lanes8 det = h0 * a0 - e01 * a01 - e02 * a02;
-    // Axial vector of e s - s e.
-    const lanes8 w0 = e02 * s01 + e12 * s1 + e2 * s12 - (e01 * s02 + e1 * s12 + e12 * s2);
-    const lanes8 w1 = e0 * s02 + e01 * s12 + e02 * s2 - (e02 * s0 + e12 * s01 + e2 * s02);
-    const lanes8 w2 = e01 * s0 + e1 * s01 + e12 * s02 - (e0 * s01 + e01 * s1 + e02 * s12);
-    const lanes8 over = 1.0f / det;
-    const lanes8 t0 = over * (a0 * w0 + a01 * w1 + a02 * w2);
-    const lanes8 t1 = over * (a01 * w0 + a1 * w1 + a12 * w2);
-    const lanes8 t2 = over * (a02 * w0 + a12 * w1 + a2 * w2);
-    p[0] = r[0] * s0 + (r[1] * (s01 + t2) + r[2] * (s02 - t1));
-    p[1] = r[0] * (s01 - t2) + (r[1] * s1 + r[2] * (s12 + t0));
-    p[2] = r[0] * (s02 + t1) + (r[1] * (s12 - t0) + r[2] * s2);
+    law_of(k, strain, r, p);
     p[0] = p[0] + c[0] * active;
     for (int j = 0; j < 3; ++j) p[j] = chosen(valid, p[j] * at.weight(), nothing<lanes8>());
     at.forces_of(p, force);

@@ -1,5 +1,5 @@
 // Eight complete subtrees of a type, in the lanes of vector registers: ten displacements in, ten forces out. ``Type`` has the
-// tables of the type (subtrees/simd8_tables.py): its SHAPE; NODES of each leaf; in the subtree's Maubach frame, rest positions AT of
+// tables of the type (subtrees/cpu.py): its SHAPE; NODES of each leaf; in the subtree's Maubach frame, rest positions AT of
 // the nodes over a leaf's edge, and FRAME and HAND of each leaf; the different columns AXES of these frames, and which three
 // make the frame of a leaf (AXES_OF).
 #pragma once
@@ -10,6 +10,7 @@ namespace corot {
 
 // A leaf of each of eight subtrees; see elements8.h for what a place has.
 template <class Subtrees> struct Leaf {
+    typedef lanes8 N;
     const Subtrees& of;
     const int number;
     const masks8 excluded;

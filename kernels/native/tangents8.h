@@ -1,5 +1,4 @@
-// Products of the corotated law's stiffness with rotations found once, for eight elements; see corotated/kept_gradients.py and
-// corotated/kept_exact.py.
+// Products of the corotated law's stiffness with rotations found once, for eight elements; see corotated/tangent.py.
 #pragma once
 
 #include "elements8.h"

@@ -14,14 +14,14 @@ import functools
 
 import warp as wp
 
-from warp_corot.kernels.corotated.algebraic import turned_stress
+from warp_corot.kernels.corotated.corotated import turned_stress
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial
 from warp_corot.kernels.elements.dilatation import VOLUME as VOLUME_CHANGE
 from warp_corot.kernels.elements.dilatation import mean_of
 from warp_corot.kernels.elements.elements import Subtrees, load_node, root_of, store_node
 from warp_corot.kernels.elements.shapes import columns_of, leaf_forces_of
+from warp_corot.kernels.elements.simd8 import law_kernel
 from warp_corot.kernels.math.matrices import column
-from warp_corot.kernels.modules import unique_kernel
 from warp_corot.kernels.subtrees.forces import (
     dilatation_sums_of,
     dilating_leaves,
@@ -239,7 +239,7 @@ def step_block(layout: Layout) -> wp.Kernel:
     sums = shared_numbers(max(layout.sum_count, 1), "sums of dilatations")
     waiting, enlist, do_one, collect = _left_out_of(layout, displacement, slot)
 
-    @unique_kernel(
+    @law_kernel(
         grid_stride=False,
         launch_bounds=(threads, max(BUSY_THREADS // threads, 1)),
     )

@@ -21,11 +21,11 @@ from dataclasses import dataclass
 
 import warp as wp
 
-from warp_corot.kernels.corotated.algebraic import stretch_stress, turned_stress
+from warp_corot.kernels.corotated.corotated import stretch_stress, turned_stress
 from warp_corot.kernels.elements.dilatation import VOLUME, pressure_stress_of
 from warp_corot.kernels.elements.elements import load_node, store_node
+from warp_corot.kernels.elements.simd8 import law_kernel
 from warp_corot.kernels.math.matrices import column, identity3
-from warp_corot.kernels.modules import unique_kernel
 from warp_corot.kernels.tables.shapes import fingerprint
 
 from .block_memory import LOAD, STORE, numbers_at, vectors_at
@@ -244,7 +244,7 @@ def step_patches(layout: Layout) -> wp.Kernel:
         slot(wp.static(STORE), number_in(targets, 2), f2)
         slot(wp.static(STORE), number_in(targets, 3), f3)
 
-    @unique_kernel(grid_stride=False, launch_bounds=(threads, 1))
+    @law_kernel(grid_stride=False, launch_bounds=(threads, 1))
     def step_patches(
         # In
         body: PatchBody,

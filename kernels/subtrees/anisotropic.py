@@ -14,8 +14,8 @@ from warp_corot.kernels.clusters.laws import ActiveMaterial
 from warp_corot.kernels.corotated.anisotropic import FibreMaterial, fibre_stress, filled, listed_stress
 from warp_corot.kernels.corotated.well_conditioned import definite_law, definite_strain, is_definite, load_axes
 from warp_corot.kernels.elements.elements import ForestElements, scatter_stress
+from warp_corot.kernels.elements.simd8 import law_kernel
 from warp_corot.kernels.math.rotation import ITERATIONS, byers_xu, column, identity3, newton_rotation, quick_rotation
-from warp_corot.kernels.modules import unique_kernel
 
 from .cuda import scatter_subtrees
 from .degenerate import repair_flagged
@@ -83,7 +83,7 @@ repair_leaves = repair_flagged(FibreMaterial, fibre_stress(byers_xu))
 _quick_stress = listed_stress(quick_rotation)
 
 
-@unique_kernel()
+@law_kernel()
 def scatter_flat(
     # In
     elements: ForestElements,

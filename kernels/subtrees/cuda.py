@@ -3,7 +3,7 @@
 Three things make it fast. Forces are summed over the eight leaves in registers, and over a group of eight subtrees in
 shared memory, where a table tells each lane which slots to add up; so each node of a group takes one atomic addition.
 Sums go to global memory as 16-byte vector reductions if the card has them. The stress comes from a root of one
-polynomial (``corotated.algebraic``), in the same way for small strains and large ones.
+polynomial (``corotated.corotated``), in the same way for small strains and large ones.
 
 A leaf that is flat, inverted or strained far beyond order one adds nothing. Its bit is set in its subtree's byte, and
 the subtree is put on a list; ``degenerate`` computes those leaves. A body whose subtrees are all of one type has a
@@ -15,8 +15,8 @@ from typing import Any
 
 import warp as wp
 
-from warp_corot.kernels.corotated.algebraic import stretch_stress
-from warp_corot.kernels.elements.constitutive import IsotropicMaterial
+from warp_corot.kernels.corotated.corotated import stretch_stress
+from warp_corot.kernels.elements.constitutive import IsotropicMaterial, RotatedMaterial, linear_stress
 from warp_corot.kernels.elements.dilatation import Dilatation
 from warp_corot.kernels.elements.elements import (
     ForestElements,
@@ -28,7 +28,7 @@ from warp_corot.kernels.elements.elements import (
     node_displacements,
     root_of,
 )
-from warp_corot.kernels.modules import unique_kernel
+from warp_corot.kernels.elements.simd8 import law_kernel
 
 from .degenerate import DegenerateList, append, list_of, reserve
 from .forces import (
@@ -36,13 +36,12 @@ from .forces import (
     isotropic_leaves,
     leaf_stress,
     mat10,
-    maubach_frame,
     own_forces,
+    own_turn,
     pressure_leaves,
-    shared_forces,
     shared_pressure,
+    shared_turn,
     subtree_forces,
-    turn_in,
     turn_out,
 )
 from .memory import BLOCK, add_single, group_memory, load_single, memory_of
@@ -82,6 +81,7 @@ def scatter_subtrees(
     shared: wp.Function = nothing_shared,
     missed: str = "",
     resident: int = 0,
+    turn: wp.Function = own_turn,
 ) -> wp.Kernel:
     """Forces of subtrees of one type under a law of leaves (``forces``). Launch with block_dim BLOCK.
 
@@ -94,12 +94,14 @@ def scatter_subtrees(
         Material: The struct that the law reads.
         missed: "": the law leaves no leaf out; "flags": left-out leaves are flagged; "list": and their subtrees listed.
         resident: The number of blocks for which a multiprocessor's registers must have room; 0: any.
+        turn: The policy of rotations (``forces``); with shared ones a subtree is left out whole, and listed by itself.
     """
     load, add = memory_of(shape, grouped)
     forces = subtree_forces(shape, uniform, leaves)
     listed, options = missed == "list", {"launch_bounds": (BLOCK, resident)} if resident else {}
+    own = turn is own_turn
 
-    @unique_kernel(grid_stride=False, **options)
+    @law_kernel(grid_stride=False, **options)
     def scatter_subtrees(
         # In
         subtrees: Subtrees,
@@ -112,18 +114,21 @@ def scatter_subtrees(
     ):
         s = wp.tid()
         h, q, mirror = root_of(subtrees, s)
-        q0, q1, q2 = maubach_frame(q, mirror)
-        y = turn_in(load(subtrees, s, u), q0, q1, q2, 1.0 / h)
+        y, r0, r1, r2, is_good = turn(material, s, load(subtrees, s, u), q, h, mirror)
         first = wp.where(wp.static(uniform), 0, subtrees.first[s])
-        g, mask = forces(y, h, material, shared(material, y, first, q0, q1, q2), first)
+        g, mask = forces(y, h, material, shared(material, y, first, r0, r1, r2), first)
+        if wp.static(not own) and not is_good:
+            g = mat10()
+            mask = 255
         if wp.static(missed != ""):
             flagged[s] = wp.uint8(mask)
         reserved = int(0)
         if wp.static(listed):
             reserved = reserve(degenerate, list_of(s // BLOCK), mask != 0, subtrees.code.shape[0] - s)
-        add(subtrees, s, turn_out(g, q0, q1, q2), f)
+        add(subtrees, s, turn_out(g, r0, r1, r2), f)
         if wp.static(listed):
-            append(degenerate, list_of(s // BLOCK), reserved, subtrees.first[s], mask, subtrees.code.shape[0] - s)
+            place = wp.where(wp.static(own), subtrees.first[s], s)
+            append(degenerate, list_of(s // BLOCK), reserved, place, mask, subtrees.code.shape[0] - s)
 
     return scatter_subtrees
 
@@ -147,45 +152,13 @@ def scatter_dilatation(shape: int, grouped: bool, uniform: bool, of: Dilatation)
     )
 
 
-@functools.cache
 def scatter_subtrees_shared(shape: int, grouped: bool, uniform: bool, given: bool, listed: bool) -> wp.Kernel:
-    """Corotated forces of subtrees whose leaves share a rotation: the subtree root's, or a given one from further up.
-
-    Launch with block_dim BLOCK.
-    """
-    load, add = memory_of(shape, grouped)
-    forces = shared_forces(shape, uniform, given)
-
-    @unique_kernel(grid_stride=False)
-    def scatter_subtrees_shared(
-        # In
-        subtrees: Subtrees,
-        material: IsotropicMaterial,
-        u: wp.array[wp.vec4],
-        rotations: wp.array[wp.mat33],
-        unit: wp.array[wp.int32],
-        # Out
-        f: wp.array[wp.vec4],
-        flagged: wp.array[wp.uint8],
-        degenerate: DegenerateList,
-    ):
-        s = wp.tid()
-        h, q, mirror = root_of(subtrees, s)
-        x = load(subtrees, s, u)
-        turn = wp.mat33()
-        if wp.static(given):
-            turn = rotations[unit[s]] * q
-        g, mask = forces(x, q, h, mirror, turn, material, wp.where(wp.static(uniform), 0, subtrees.first[s]))
-        if wp.static(not given):
-            flagged[s] = wp.uint8(mask)
-        reserved = int(0)
-        if wp.static(listed and not given):
-            reserved = reserve(degenerate, list_of(s // BLOCK), mask != 0, subtrees.code.shape[0] - s)
-        add(subtrees, s, g, f)
-        if wp.static(listed and not given):
-            append(degenerate, list_of(s // BLOCK), reserved, s, mask, subtrees.code.shape[0] - s)
-
-    return scatter_subtrees_shared
+    """Corotated forces of subtrees whose leaves share a rotation: that of the subtree's root, or a given one."""
+    leaves, missed = isotropic_leaves(shape, always_trusted(linear_stress)), "list" if listed else "flags"
+    turn, missed, resident = shared_turn(shape, given), "" if given else missed, 0 if given else 7
+    return scatter_subtrees(
+        shape, grouped, uniform, leaves, RotatedMaterial, missed=missed, resident=resident, turn=turn
+    )
 
 
 # --- all of a body in one launch ------------------------------------------------------------------------------------
@@ -232,7 +205,7 @@ def scatter_body(uniform: bool) -> wp.Kernel:
     subtree0, subtree1, subtree2 = (_scatter_subtree(shape, uniform) for shape in range(3))
     add_neighbours = add_four_forces(2)
 
-    @unique_kernel(grid_stride=False, launch_bounds=(BLOCK, min(RESIDENT)))
+    @law_kernel(grid_stride=False, launch_bounds=(BLOCK, min(RESIDENT)))
     def scatter_body(
         # In
         ranges: wp.array[WorkRange],

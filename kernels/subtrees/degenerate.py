@@ -6,7 +6,7 @@ from typing import Any
 
 import warp as wp
 
-from warp_corot.kernels.corotated.algebraic import corotated_stress
+from warp_corot.kernels.corotated.corotated import corotated_stress
 from warp_corot.kernels.corotated.tangent import keep_gradients
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial, rotated_stress
 from warp_corot.kernels.elements.elements import (
@@ -19,11 +19,12 @@ from warp_corot.kernels.elements.elements import (
     scatter_stress,
 )
 from warp_corot.kernels.elements.forces import repair_forces
+from warp_corot.kernels.elements.simd8 import LAW_HEADERS, law_kernel
 from warp_corot.kernels.math.matrices import identity3
 from warp_corot.kernels.math.rotation import rotation_out_of_line
 from warp_corot.kernels.modules import unique_kernel
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options({"enable_backward": False, "extra_build_options": LAW_HEADERS})
 
 #: Number of leaves of a subtree.
 LEAVES = 8
@@ -242,7 +243,7 @@ def root_rotation(roots: ForestElements, s: int, u: wp.array[wp.vec4]):
 # --- by a list ------------------------------------------------------------------------------------------------------
 
 
-@unique_kernel(grid_stride=False)
+@law_kernel(grid_stride=False)
 def repair_listed_own(
     # In
     threads: int,
@@ -330,7 +331,7 @@ def repair_listed_shared(
 
 
 @functools.cache
-def repair_flagged(Material: type, stress: wp.Function, kernel: Callable = unique_kernel) -> wp.Kernel:
+def repair_flagged(Material: type, stress: wp.Function, kernel: Callable = law_kernel) -> wp.Kernel:
     """Add the forces of flagged leaves under a law of ``elements.forces`` that is right for every F.
 
     So many ``lanes`` share a word of 64 bits, one for each leaf of eight subtrees; nearly always all bits are zero. In

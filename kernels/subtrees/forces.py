@@ -1,7 +1,7 @@
 """Corotated forces of one complete subtree in registers: ten displacements in, ten nodal forces out.
 
 Kernels that read and write their nodes in different ways share this code (``cuda``, ``stepping.block``). Stresses are
-computed from displacement gradients, so that small strains keep their digits (``corotated.algebraic.stretch_stress``).
+computed from displacement gradients, so that small strains keep their digits (``corotated.corotated.stretch_stress``).
 A leaf that is flat, inverted or strained far beyond order one is left out and reported: bit k of the mask stands for
 leaf k in tree order.
 """
@@ -13,8 +13,8 @@ from typing import Any
 
 import warp as wp
 
-from warp_corot.kernels.corotated.algebraic import stretch_stress
-from warp_corot.kernels.elements.constitutive import IsotropicMaterial, linear_stress
+from warp_corot.kernels.corotated.corotated import stretch_stress
+from warp_corot.kernels.elements.constitutive import IsotropicMaterial, RotatedMaterial
 from warp_corot.kernels.elements.dilatation import VOLUME as VOLUME_CHANGE
 from warp_corot.kernels.elements.dilatation import Dilatation, mean_of, pressure_stress_of
 from warp_corot.kernels.elements.shapes import columns_of, leaf_forces_of
@@ -79,14 +79,25 @@ def always_trusted(stress: wp.Function) -> wp.Function:
     return trusted_stress
 
 
+@wp.func
+def lame_of(material: IsotropicMaterial, t: int):
+    return material.mu[t], material.lam[t]
+
+
+@wp.func
+def lame_of(material: RotatedMaterial, t: int):
+    return material.isotropic.mu[t], material.isotropic.lam[t]
+
+
 @functools.cache
 def isotropic_leaves(shape: int, stress: wp.Function) -> wp.Function:
     """The law of leaves of a ``stress`` of A and Lamé's parameters, which also says whether it may be trusted."""
     into_leaf, out_of_leaf = turns_of(shape)
 
     @wp.func
-    def isotropic_leaf(material: IsotropicMaterial, extra: float, leaf: int, t: int, area: float, g: wp.mat33):
-        p, trusted = stress(into_leaf(leaf, g), area * material.mu[t], area * material.lam[t])
+    def isotropic_leaf(material: Any, extra: float, leaf: int, t: int, area: float, g: wp.mat33):
+        mu, lam = lame_of(material, t)
+        p, trusted = stress(into_leaf(leaf, g), area * mu, area * lam)
         return out_of_leaf(leaf, p), trusted, trusted
 
     return isotropic_leaf
@@ -218,42 +229,39 @@ def turned_back_of(shape: int) -> wp.Function:
     return turned_back
 
 
-@functools.cache
-def shared_forces(shape: int, uniform: bool, given: bool) -> wp.Function:
-    """Forces from ten displacements of leaves that all have one rotation, and a mask of those left out: none or all.
+@wp.func
+def own_turn(material: Any, s: int, x: mat10, q: wp.mat33, h: float, mirror: float):
+    """A rotation policy: displacements of the ten nodes for the leaves' laws, in edge lengths of a leaf; the columns by
+    which forces return to world space; and whether these may be trusted. Here leaves have their own rotations."""
+    q0, q1, q2 = maubach_frame(q, mirror)
+    return turn_in(x, q0, q1, q2, 1.0 / h), q0, q1, q2, True
 
-    The rotation is that of the subtree's root, or a given one; ``turn`` is the given one times the subtree's frame
-    ``q``. The ten displacements are turned back once; then the leaves are linear elements in the subtree's own frame.
-    """
+
+@functools.cache
+def shared_turn(shape: int, given: bool) -> wp.Function:
+    """The policy of leaves that all have one rotation, that of the subtree's root or a given one: the ten displacements
+    are turned back once; then the leaves are linear elements in the subtree's own frame."""
     columns, turned_back = columns_of(shape), turned_back_of(shape)
-    forces = subtree_forces(shape, uniform, isotropic_leaves(shape, always_trusted(linear_stress)))
 
     @wp.func
-    def shared_forces(
-        x: mat10, q: wp.mat33, h: float, mirror: float, turn: wp.mat33, material: IsotropicMaterial, first: int
-    ):
+    def shared_turn(material: RotatedMaterial, s: int, x: mat10, q: wp.mat33, h: float, mirror: float):
         q0, q1, q2 = maubach_frame(q, mirror)
-        r0, r1, r2 = maubach_frame(turn, mirror)
+        r0, r1, r2 = q0, q1, q2
         inv_h = 1.0 / h
-        degenerate = int(0)
-        if wp.static(not given):
+        is_good = bool(True)
+        if wp.static(given):
+            r0, r1, r2 = maubach_frame(material.rotations[material.unit[s]] * q, mirror)
+        else:
             # The subtree's edge is two of a leaf's.
             c0, c1, c2 = columns(x[0], x[1], x[2], x[3])
             half = 0.5 * inv_h
-            z0, z1, z2, trusted = newton_rotation(q0 + half * c0, q1 + half * c1, q2 + half * c2, mirror)
-            r0 = wp.static(0.5**ITERATIONS) * z0
-            r1 = wp.static(0.5**ITERATIONS) * z1
-            r2 = wp.static(0.5**ITERATIONS) * z2
-            if not trusted:
-                degenerate = 255
-        y = turned_back(x, inv_h, q0, q1, q2, r0, r1, r2)
-        g, _degenerate = forces(y, h, material, 0.0, first)
-        g = turn_out(g, r0, r1, r2)
-        if degenerate != 0:
-            g = mat10()
-        return g, degenerate
+            r0, r1, r2, is_good = newton_rotation(q0 + half * c0, q1 + half * c1, q2 + half * c2, mirror)
+            r0 = wp.static(0.5**ITERATIONS) * r0
+            r1 = wp.static(0.5**ITERATIONS) * r1
+            r2 = wp.static(0.5**ITERATIONS) * r2
+        return turned_back(x, inv_h, q0, q1, q2, r0, r1, r2), r0, r1, r2, is_good
 
-    return shared_forces
+    return shared_turn
 
 
 # --- the dilatation that the eight leaves of a subtree share ---------------------------------------------------------

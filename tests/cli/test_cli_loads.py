@@ -262,7 +262,7 @@ REFUSED = [
     (["--fix", "sphere(x, 0, 0, 1)"], "differs from node to node"),
     (["--fix", "nearest(0, 0, 0, 0.5)"], "nearest takes a number of nodes"),
     (["--fix", "box(0, 0, 1)"], "box takes 6 arguments, not 3"),
-    (["--region", "x > 0.1", "hard"], "Young's modulus is 'hard'; it must be"),
+    (["--region", "x > 0.1", "hard"], "'hard' is not a number"),
     (["--region", "x > 9", "5kPa"], "there is no tetrahedron in it"),
     (["--probe", "top"], "--probe is for --csv"),
     (["--probe", "9 9 9", "--csv", "a.csv"], "m outside the body"),

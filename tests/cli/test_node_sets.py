@@ -15,7 +15,7 @@ BAR = wc.TetForest.box((2, 1, 1), 0.05, 3)
 LEFT, RIGHT = (np.flatnonzero(BAR.points[:, 0] == x) for x in (0.0, 0.1))
 
 ABAQUS = """*Part, name=Tip
-*Node, nset=Everything
+*Node
  10, 0, 0, 0
  20, 1, 0, 0
  30, 0, 1, 0
@@ -26,33 +26,21 @@ ABAQUS = """*Part, name=Tip
  7, 10, 20, 30
 *Nset, nset=Base, generate
  10, 30, 10
-*Nset, nset=Both
- Base, 40
 *End Part
 *Assembly, name=A
 *Instance, name=one, part=Tip
 *End Instance
-*Instance, name=two, part=Tip
- 5., 0., 0.
-*End Instance
-*Nset, nset=Pulled, instance=two
+*Nset, nset=Pulled, instance=one
  20,
 *End Assembly
 """
 
 
 def test_abaqus(tmp_path):
-    """By lists, ranges, other sets and node lines; of a single instance; and the nodes of element sets."""
+    """By lists and ranges; of a single instance; and the nodes of element sets."""
     (tmp_path / "a.inp").write_text(ABAQUS)
     sets = wc.TetMesh.load(tmp_path / "a.inp").node_sets
-    expected = {
-        "Everything": range(8),
-        "Solid": range(8),
-        "Face": [0, 1, 2, 4, 5, 6],
-        "Base": [0, 1, 2, 4, 5, 6],
-        "Both": range(8),
-        "Pulled": [5],
-    }
+    expected = {"Solid": range(4), "Face": range(3), "Base": range(3), "Pulled": [1]}
     assert {name: np.flatnonzero(nodes).tolist() for name, nodes in sets.items()} == {
         name: list(nodes) for name, nodes in expected.items()
     }

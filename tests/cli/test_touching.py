@@ -14,7 +14,7 @@ from pxr import Usd, UsdGeom, UsdValidation
 from stages import drawn
 
 import warp_corot as wc
-from warp_corot.cli.tool_paths import read_tool_path
+from warp_corot.cli.contact import read_tool_path
 from warp_corot.errors import InputError
 
 BLOCK = wc.TetForest.box((2, 2, 1), 0.02, 3)
@@ -66,7 +66,7 @@ def test_a_dropped_body_falls_by_the_given_height(block, folder):
 
 
 def press(folder: Path, *more: object) -> int:
-    write_path(folder, "time [ms],x [mm],y,z [mm]\n0,20,0.02,30\n100,20,2cm,28\n200,20,2cm,28\n")
+    write_path(folder, "time [ms],x [mm],y,z [mm]\n0,20,0.02,30\n100,20,0.02,28\n200,20,0.02,28\n")
     tool = ["--tool", "sphere:r=1cm", "--tool-path", "path.csv", "--fix", "z == zmin", "--gravity", 0, 0, 0]
     return simulate("block.vtk", *tool, "-o", "a.usd", "--duration", 0.2, "--fps", 20, *SOFT, *more)
 
@@ -89,16 +89,16 @@ def test_a_tool_presses_and_its_force_is_in_table_and_stage(block, folder):
         np.testing.assert_allclose(place, (0.02, 0.02, z), atol=1e-6)
     felt = prim.GetPrim().GetAttribute("contact:force")
     assert felt.Get(stage.GetEndTimeCode())[2] == pytest.approx(force[-1], rel=1e-5)
-    for name in ("tetrahedra", "surface"):
-        drawn = UsdGeom.PrimvarsAPI(stage.GetPrimAtPath(f"/SoftBody/{name}"))
-        on_nodes, pressure = (
-            np.array(drawn.GetPrimvar(f"contact{kind}").Get(stage.GetEndTimeCode())) for kind in ("Force", "Pressure")
-        )
-        assert len(on_nodes) == len(pressure) == len(UsdGeom.PointBased(drawn.GetPrim()).GetPointsAttr().Get(0))
-        np.testing.assert_allclose(on_nodes.astype(float).sum(axis=0)[2], -force[-1], rtol=1e-4)
-        assert pressure.max() > force[-1] / 0.04**2  # more than all over the upper face
-        assert (pressure[np.linalg.norm(on_nodes, axis=1) > 0.0] > 0.0).all()
-        assert not np.array(drawn.GetPrimvar("contactForce").Get(0)).any()
+    drawn, skin = (UsdGeom.PrimvarsAPI(stage.GetPrimAtPath(f"/SoftBody/{name}")) for name in ("tetrahedra", "surface"))
+    on_nodes, pressure = (
+        np.array(drawn.GetPrimvar(f"contact{kind}").Get(stage.GetEndTimeCode())) for kind in ("Force", "Pressure")
+    )
+    assert len(on_nodes) == len(pressure) == len(UsdGeom.PointBased(drawn.GetPrim()).GetPointsAttr().Get(0))
+    np.testing.assert_allclose(on_nodes.astype(float).sum(axis=0)[2], -force[-1], rtol=1e-4)
+    assert pressure.max() > force[-1] / 0.04**2  # more than all over the upper face
+    assert (pressure[np.linalg.norm(on_nodes, axis=1) > 0.0] > 0.0).all()
+    assert not np.array(drawn.GetPrimvar("contactForce").Get(0)).any()
+    assert max(skin.GetPrimvar("contactPressure").Get(stage.GetEndTimeCode())) == pressure.max()
     validators = UsdValidation.ValidationRegistry().GetOrLoadAllValidators()
     assert UsdValidation.ValidationContext(validators).Validate(stage) == []
 
@@ -198,9 +198,9 @@ def test_bodies_of_a_run_file_touch_if_asked(block, folder):
     [
         ("0,0,0,0\n0.1,0,nan,0\n", "line 2: y is 'nan'"),
         ("0,0,0,0\n0.1,0,0,x\n", "line 2: z is 'x'"),
-        ("1,0,0,0\n0.1,0,0,0\n", "times must increase"),
-        ("0,0,0,0\n0,0,0,1\n", "times must increase"),
-        ("0,0,0\n1,0,0\n", "3 columns"),
+        ("1,0,0,0\n0.1,0,0,0\n", "increasing numbers"),
+        ("0,0,0,0\n0,0,0,1\n", "increasing numbers"),
+        ("0,0,0\n1,0,0\n", "no column 'z'"),
         ("time,x,y\n0,0,0\n", "no column 'z'"),
         ("time,x,y,z,qx\n0,0,0,0,0\n", "no column 'qy'"),
         ("time,x,y,z,u\n0,0,0,0,0\n", "column 'u'"),
@@ -240,10 +240,10 @@ def test_options_that_do_not_fit_are_refused(block, folder, capsys, said, args):
 
 
 def test_columns_with_units_and_without_names_are_the_same(folder):
-    named = write_path(folder, "t,z [cm],y [mm],x,qw,qx,qy,qz\n0,1,2,3,1,0,0,0\n1s,1,2,3mm,1,0,0,0\n")
+    named = write_path(folder, "t,z [cm],y [mm],x,qw,qx,qy,qz\n0,1,2,3,1,0,0,0\n1,1,2,3,1,0,0,0\n")
     times, positions, turns = read_tool_path(named)
     np.testing.assert_allclose(times, [0, 1])
-    np.testing.assert_allclose(positions, [(3, 0.002, 0.01), (0.003, 0.002, 0.01)])
+    np.testing.assert_allclose(positions, [(3, 0.002, 0.01)] * 2)
     np.testing.assert_allclose(turns, [(0, 0, 0, 1)] * 2)
     with pytest.raises(InputError, match="cannot be read"):
         read_tool_path(folder)

@@ -13,8 +13,8 @@ import pytest
 from command_line import run
 
 import warp_corot as wc
-from warp_corot.cli import make_parser
-from warp_corot.cli.options import RunOptions, StrictParser, add_declared
+from warp_corot.cli import Parser, make_parser
+from warp_corot.cli.options import RUN, add_options
 from warp_corot.cli.run_file import bodies_of
 from warp_corot.cli.run_setup import set_up
 from warp_corot.cli.view import _carry_over, run_text
@@ -34,8 +34,8 @@ def asked(*words):
 
 
 def test_options_are_those_of_simulate():
-    parser = StrictParser(prog="simulate")
-    add_declared(parser, RunOptions)
+    parser = Parser(prog="simulate")
+    add_options(parser, RUN)
     (args,) = asked("box", "--device", "cpu")
     for action in parser._actions:
         if action.dest not in ("help", "input", "device"):

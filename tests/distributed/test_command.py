@@ -90,7 +90,7 @@ def test_two_ranks_draw_the_contact_of_the_whole_body(folder):
     found = []
     for name in ("one.usda", "two.usda"):
         stage = Usd.Stage.Open(name)
-        mesh = stage.GetPrimAtPath("/SoftBody/surface")
+        mesh = stage.GetPrimAtPath("/SoftBody/tetrahedra")
         found.append(np.array(UsdGeom.PrimvarsAPI(mesh).GetPrimvar("contactForce").Get(1.0)))
     assert found[0][:, 1].sum() > 0.01
     # Both runs choose their own steps, and the body has just landed.

@@ -211,7 +211,6 @@ REFUSED_MODELS = {
     "MassSpring": wc.MassSpring(),
     "EdgeStVK": wc.EdgeStVK(),
     "rotation_level is 0": wc.Corotated(rotation_level=0),
-    "stiffness is 'sparse'": wc.Corotated(stiffness="sparse"),
 }
 
 

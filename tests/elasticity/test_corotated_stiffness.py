@@ -31,7 +31,6 @@ OWN = {
     "byers-xu": {},
     "svd": {"rotation": "svd"},
     "leaf by leaf": {"subtrees": False},
-    "sparse": {"stiffness": "sparse"},
 }
 
 
@@ -62,8 +61,6 @@ def is_short(options, case):
 @pytest.mark.parametrize(("options", "case"), crossed(OWN, CASES, is_short))
 def test_own_rotations(options, case, device, rng):
     mesh = MESHES[case]()
-    if case == "general" and options == "sparse":
-        pytest.skip("for forests")
     field = bound(mesh, device, **OWN[options])
     u, p = turned(mesh, rng, 0.1), random_displacement(mesh, rng, 1.0)
     assert_equal(product(field, u, p), with_own_rotations(mesh, u, p))

@@ -9,7 +9,7 @@ from fibres import random_axes
 from tangents import assert_diagonal, assert_equal, assert_symmetric, difference, product
 
 import warp_corot as wc
-from warp_corot.kernels.elements.fibres import ReinforcedMaterial, reinforced_stress
+from warp_corot.kernels.corotated.anisotropic import REINFORCED, ReinforcedMaterial
 from warp_corot.kernels.elements.forces import scatter_forces
 from warp_corot.kernels.elements.simd8 import LANES
 
@@ -225,7 +225,7 @@ def test_elements_side_by_side_do_what_each_does_alone(is_general, amount, rng):
     body.displacements = random_displacement(mesh, rng, amount)
     field, u = MODEL.bind(body), body.state.displacements
     expected, found = (wp.zeros_like(body.state.forces) for _ in range(2))
-    alone = scatter_forces(body.discretization.element_kind, ReinforcedMaterial, reinforced_stress)
+    alone = scatter_forces(body.discretization.element_kind, ReinforcedMaterial, REINFORCED.stress)
     wp.launch(alone, count, [field.elements, field.material, u], [expected], device="cpu")
     field.add_forces(u, found)
     np.testing.assert_allclose(found.numpy(), expected.numpy(), rtol=0, atol=1e-5 * np.abs(expected.numpy()).max())

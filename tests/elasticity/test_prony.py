@@ -11,8 +11,8 @@ from tangents import assert_diagonal, assert_symmetric, on_device, product
 import warp_corot as wc
 from warp_corot.elasticity.float64 import displacement_gradients, green_strain
 from warp_corot.kernels.elements import added as prony
-from warp_corot.kernels.elements.forces import scatter_forces
-from warp_corot.kernels.elements.simd8 import LANES
+from warp_corot.kernels.elements.forces import element_law, scatter_forces
+from warp_corot.kernels.elements.simd8 import LANES, PRONY
 
 MATERIAL = {"young": 500.0, "poisson": 0.3, "density": 10.0}
 MU, LAM = oracle.lame(MATERIAL["young"], MATERIAL["poisson"])
@@ -222,7 +222,7 @@ def test_elements_side_by_side_do_what_each_does_alone(is_general, rng):
     material.elapsed.fill_(0.01)
     body.displacements = random_displacement(mesh, rng, 0.3)
     expected, found = (wp.zeros_like(state.forces) for _ in range(2))
-    alone = scatter_forces(kind, prony.PronyMaterial, prony.prony_stress)
+    alone = scatter_forces(kind, prony.PronyMaterial, element_law(PRONY.code, prony.PronyMaterial).stress)
     wp.launch(alone, count, [field.elements, material, state.displacements], [expected], device="cpu")
     field.add_own_forces(state.displacements, found)
     np.testing.assert_allclose(found.numpy(), expected.numpy(), rtol=0, atol=1e-5 * np.abs(expected.numpy()).max())

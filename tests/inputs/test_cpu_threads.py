@@ -17,7 +17,7 @@ import warp_corot as wc
 from warp_corot.errors import InputError
 from warp_corot.inputs import cpu_threads
 from warp_corot.inputs.cpu_threads import LEAST_ELEMENTS, Region, core_count, launch, team_for, team_of
-from warp_corot.solvers.implicit.dissection import dissected
+from warp_corot.solvers.implicit.assembled import dissected
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="bodies take one thread there")
 

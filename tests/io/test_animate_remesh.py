@@ -8,7 +8,7 @@ from pxr import Usd, UsdGeom
 from stages import SURFACE, TETS, assert_whole, edges_meet_in_pairs, faults, prims
 
 import warp_corot as wc
-from warp_corot.io.read.tetrahedra import load_tets
+from warp_corot.io.read.meshes import load_tets
 from warp_corot.io.write.animate import Recording, record
 
 REMESH = wc.OnlineRemesh(refine_above=1.02, simplify_below=1.005, max_level=8)
@@ -74,7 +74,7 @@ def test_each_frame_shows_the_present_mesh(device, tmp_path):
         assert (young @ mesh.volumes) / VOLUME == pytest.approx(3e4, rel=1e-5)  # its integral does not change
     for k in range(9):
         assert_whole(stage, k + 0.5, VOLUME)
-    assert len(load_tets(tmp_path / "a.usd").tets) == done.elements[0]
+    assert len(load_tets(tmp_path / "a.usd").cells) == done.elements[0]
 
 
 def test_one_of_two_bodies_is_remeshed(tmp_path):

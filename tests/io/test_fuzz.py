@@ -27,7 +27,7 @@ FEWER = {"dicom": 1, "vtp": 25, "checkpoint-remesh": 20}
 ENDS_ONE_IN = {"usdc": 1000, "usdc-tets": 1000, "usdz": 1000}
 #: Formats whose reader is tested by another format in the short run.
 LONG_ONLY = {
-    *("ply-text", "off", "stl-text", "usdz", "usda-tets", "scene", "nii", "mgh", "mgz", "nrrd-gz", "mhd", "checkpoint"),
+    *("ply-text", "off", "stl-text", "usdz", "usda-tets", "scene", "nii", "nrrd-gz", "mhd", "checkpoint"),
     *("msh-2", "msh-2-binary", "meshb", "vol", "med", "avs", "f3grid", "su2"),
     *("vtk", "vtk-text", "vtk-image", "vtu-text", "vtu-meshio", "vts", "vtr"),
 }

@@ -9,8 +9,7 @@ import pytest
 from pxr import Gf, Sdf, Usd, UsdGeom, Vt
 
 from warp_corot.errors import InputError
-from warp_corot.io.read.assets import ASSETS
-from warp_corot.io.read.tetrahedra import load_tets
+from warp_corot.io.read.meshes import ASSETS, load_tets
 from warp_corot.mesh.topology import boundary_faces, signed_volumes
 
 POINTS = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1]], dtype=np.float64)
@@ -49,9 +48,9 @@ def test_usd_tetrahedra_come_in_metres_and_world_space(tmp_path, suffix, kind):
     expected = 0.02 * np.stack([-y, x, z + 5.0], axis=1)
     assert loaded.points.dtype == np.float64
     assert np.allclose(loaded.points, np.concatenate([expected, expected]))
-    assert loaded.tets.dtype == np.int32
-    assert np.array_equal(loaded.tets, np.concatenate([TETS, TETS + len(POINTS)]))
-    assert (loaded.up_axis, loaded.metres_per_unit, loaded.name) == ("Z", 0.01, "body")
+    assert loaded.cells.dtype == np.int32
+    assert np.array_equal(loaded.cells, np.concatenate([TETS, TETS + len(POINTS)]))
+    assert (loaded.up_axis, loaded.metres, loaded.name) == ("Z", 0.01, "body")
 
 
 def test_usdz(tmp_path):
@@ -65,8 +64,8 @@ def test_usdz(tmp_path):
 def test_the_bear_is_as_the_asset_says():
     loaded = load_tets("warp:bear", scale=ASSETS["bear"].scale)
     assert loaded.points.shape == (1986, 3)
-    assert loaded.tets.shape == (5354, 4)
-    assert (loaded.up_axis, loaded.metres_per_unit, loaded.name) == ("Y", 1.0, "bear")
+    assert loaded.cells.shape == (5354, 4)
+    assert (loaded.up_axis, loaded.metres, loaded.name) == ("Y", 1.0, "bear")
     assert np.isclose(np.ptp(loaded.points[:, 1]), 0.554, atol=1e-3)
 
 
@@ -77,7 +76,7 @@ def test_meshio_formats(tmp_path, suffix):
     meshio.write_points_cells(path, POINTS, [("triangle", [[0, 1, 2]]), ("tetra", TETS[:1]), ("tetra", TETS[1:])])
     loaded = load_tets(path, scale=0.5)
     assert np.allclose(loaded.points, 0.5 * POINTS)
-    assert np.array_equal(loaded.tets, TETS)
+    assert np.array_equal(loaded.cells, TETS)
 
 
 def test_second_order_tetrahedra_give_their_corners(tmp_path, caplog):
@@ -88,7 +87,7 @@ def test_second_order_tetrahedra_give_their_corners(tmp_path, caplog):
     meshio.write_points_cells(path, np.concatenate([corners, middles]), [("tetra10", [list(range(10))])])
     with caplog.at_level(logging.WARNING):
         loaded = load_tets(path)
-    assert np.array_equal(loaded.tets, [[0, 1, 2, 3]])
+    assert np.array_equal(loaded.cells, [[0, 1, 2, 3]])
     assert "second-order" in caplog.text
 
 
@@ -164,9 +163,9 @@ def test_meshes_without_usable_tetrahedra_are_refused(tmp_path):
 
 def test_a_missing_reader_is_named(tmp_path, monkeypatch):
     original = importlib.util.find_spec
-    missing = ("meshio", "gmsh", "vtkmodules")
+    missing = ("vtkmodules", "SimpleITK")
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name in missing else original(name))
-    for suffix, extra in ((".msh", "gmsh"), (".msh", "mesh"), (".vtu", "mesh")):
+    for suffix, extra in ((".vtp", "mesh"), (".vtu", "mesh"), (".nii.gz", "scans")):
         path = tmp_path / f"body{suffix}"
         path.write_text("something")
         refused(path, re.escape(f'pip install "warp-corot[{extra}]"'))

@@ -10,9 +10,10 @@ from stages import SURFACE, TETS, assert_whole, edges_meet_in_pairs, faults
 
 import warp_corot as wc
 from warp_corot.io.pictures.colors import VertexAverage, color_index
-from warp_corot.io.read.tetrahedra import load_tets
+from warp_corot.io.read.meshes import load_tets
 from warp_corot.io.write.skins import BoundSkins
 from warp_corot.io.write.usd.writer import UsdWriter
+from warp_corot.mesh.topology import boundary_faces
 
 BOX = wc.TetForest.box((2, 1, 1), 0.1, 2)
 VOLUME = 2 * 0.1**3
@@ -155,8 +156,8 @@ def test_one_color_range_holds_for_all_meshes(tmp_path):
     writer = write(tmp_path / "a.usd", flush_every=3)
     stage = Usd.Stage.Open(str(tmp_path / "a.usd"))
     for k, mesh in enumerate(SHOWN):
-        nodal = VertexAverage(mesh.tets, mesh.volumes, len(mesh.points))(state(mesh, k)[2])
-        colors = UsdGeom.PrimvarsAPI(stage.GetPrimAtPath(TETS)).GetPrimvar("displayColor").GetIndicesAttr()
+        nodal = VertexAverage.of(mesh)(state(mesh, k)[2])[np.unique(boundary_faces(mesh.tets, mesh.points)[0])]
+        colors = UsdGeom.PrimvarsAPI(stage.GetPrimAtPath(SURFACE)).GetPrimvar("displayColor").GetIndicesAttr()
         # The last digit of a rest position may decide between two neighbouring colours.
         assert np.abs(np.array(colors.Get(k)) - color_index(nodal, *writer.stress_range)).max() <= 1
 
@@ -165,7 +166,7 @@ def test_a_stage_that_changes_is_a_mesh_again_the_first_one(tmp_path):
     write(tmp_path / "a.usd", shown=[FINER, BOX, OTHER])
     loaded = load_tets(tmp_path / "a.usd")
     np.testing.assert_allclose(loaded.points, FINER.points, atol=1e-7)
-    np.testing.assert_array_equal(np.sort(loaded.tets, axis=1), np.sort(FINER.tets, axis=1))
+    np.testing.assert_array_equal(np.sort(loaded.cells, axis=1), np.sort(FINER.tets, axis=1))
 
 
 def test_a_surface_stays_the_same_on_every_mesh(tmp_path, rng):
@@ -192,7 +193,7 @@ def test_the_boundary_as_the_only_surface_is_that_of_the_present_mesh(tmp_path):
         for time in (float(k), k + 0.5)[: 2 if k + 1 < len(SHOWN) else 1]:
             drawn = np.array(surface.GetPointsAttr().Get(time), float)
             triangles = np.array(surface.GetFaceVertexIndicesAttr().Get(time)).reshape(-1, 3)
-            assert triangles.max() + 1 == len(drawn) == len(surface.GetNormalsAttr().Get(time))
+            assert triangles.max() + 1 == len(drawn)
             assert edges_meet_in_pairs(triangles)
         own = {tuple(np.float32(x)) for x in state(mesh, k)[0]}
         assert {tuple(x) for x in np.array(surface.GetPointsAttr().Get(k))} <= own
@@ -203,8 +204,8 @@ def test_wrong_use_is_named(tmp_path):
     with pytest.raises(wc.InputError, match="must be made with changing=True"):
         writer.change_mesh(FINER)
     writer = UsdWriter(tmp_path / "b.usd", BOX, fps=25, changing=True)
-    with pytest.raises(wc.InputError, match="1 skins now; there must be 0"):
-        writer.change_mesh(FINER, skins=BoundSkins([FINER]).on([FINER]))
+    with pytest.raises(wc.InputError, match="2 skins now; there must be 1"):
+        writer.change_mesh(FINER, skins=2 * BoundSkins([FINER]).on([FINER]))
     writer.write(BOX.points)
     writer.change_mesh(FINER)
     with pytest.raises(wc.InputError, match=rf"positions has shape .*; it must be \[{len(FINER.points)}, 3\]"):

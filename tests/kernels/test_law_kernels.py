@@ -17,16 +17,15 @@ import warp_corot as wc
 from warp_corot.discretization.planner import ForcePlan
 from warp_corot.elasticity.anisotropic import AnisotropicField, active_material, as_bytes
 from warp_corot.elasticity.clusters import ClusterScatter, clustered
+from warp_corot.elasticity.laws import law_of
 from warp_corot.elasticity.model import isotropic_material
 from warp_corot.kernels.clusters.laws import ActiveMaterial, anisotropic_law, isotropic_law, reinforced_law
-from warp_corot.kernels.corotated.anisotropic import FibreMaterial, fibre_stress
+from warp_corot.kernels.corotated.anisotropic import FibreMaterial, ReinforcedMaterial, fibre_stress
+from warp_corot.kernels.corotated.corotated import corotated_stress
 from warp_corot.kernels.corotated.well_conditioned import quaternions_of
 from warp_corot.kernels.elements import constitutive
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial
-from warp_corot.kernels.elements.fibres import ReinforcedMaterial
 from warp_corot.kernels.elements.forces import scatter_forces
-from warp_corot.kernels.elements.general_cuda import corotated_law
-from warp_corot.kernels.elements.ogden import ogden
 from warp_corot.kernels.math.rotation import byers_xu, quick_rotation
 from warp_corot.kernels.subtrees.anisotropic import repair_leaves, scatter_anisotropic_subtrees, scatter_flat
 from warp_corot.kernels.subtrees.cuda import scatter_law_subtrees
@@ -117,7 +116,7 @@ def test_general_elements(law, uniform, device, rng):
     u, x = state(mesh, law, rng)
     on_device = wp.array(u, dtype=wp.vec4, device=device)
     f = wp.zeros_like(on_device)
-    stress = LAWS.get(law) or corotated_law(quick_rotation)
+    stress = LAWS.get(law) or corotated_stress
     material = isotropic_of(body.discretization)
     add_forces(ClusterScatter(body.discretization.elements, isotropic_law(stress)), material, on_device, f)
     assert_right(f.numpy()[:, :3], oracle.evaluate(law, oracle_mesh(mesh), x, mu, lam)[1])
@@ -165,7 +164,7 @@ def test_laws_in_clusters_are_those_leaf_by_leaf(model, name, device, rng):
     given, _ = materials(len(mesh.tets), False, rng)
     law, Material, material = reinforced_law, ReinforcedMaterial, wc.Isotropic(**given)
     if model is OGDEN:
-        law, Material = isotropic_law(ogden(model.terms)["stress"]), IsotropicMaterial
+        law, Material = isotropic_law(law_of(model.terms).stress), IsotropicMaterial
     else:
         along, across, _ = random_axes(rng)
         material = wc.FibreReinforced(k1=1e4, k2=5.0, direction=along, across=across, angle=0.5, kappa=0.1, **given)

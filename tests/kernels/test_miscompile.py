@@ -95,10 +95,8 @@ def test_some_elements_are_left_to_the_second_kernel(name, device, rng):
     [
         wc.Corotated(subtrees=False),
         wc.Corotated(iterations=4),
-        wc.Corotated(stiffness="sparse"),
-        wc.Corotated(stiffness="dense"),
     ],
-    ids=["leaf by leaf", "4 iterations", "sparse", "dense"],
+    ids=["leaf by leaf", "4 iterations"],
 )
 def test_other_forms_of_the_corotated_force(model, device, rng):
     mesh = meshed("mixed levels")

@@ -1,12 +1,10 @@
 """Hexahedra, wedges and pyramids as tetrahedra: they fit one another and fill the cells."""
 
-import itertools
-
 import numpy as np
 import pytest
 from foreign_meshes import VOLUME, grid
 
-from warp_corot.io.read.filemesh import Block, fan, split_polyhedron, split_solids, triangles_of
+from warp_corot.io.read.filemesh import Block, split_solids, triangles_of
 from warp_corot.mesh.topology import boundary_faces, signed_volumes
 
 
@@ -75,20 +73,6 @@ def test_cells_with_merged_corners_lose_the_flat_tetrahedra():
     assert signed_volumes(points, tets).sum() == pytest.approx(0.5)
 
 
-def test_polyhedra_follow_the_same_rule():
-    """The cube given by its faces is split like the cube given by its corners."""
-    rng = np.random.default_rng(3)
-    cube = np.array(list(itertools.product((0.0, 1.0), repeat=3)))[[0, 4, 6, 2, 1, 5, 7, 3]]
-    numbers = rng.permutation(8)
-    points = np.empty((8, 3))
-    points[numbers] = cube
-    faces = [[0, 3, 2, 1], [4, 5, 6, 7], [0, 1, 5, 4], [1, 2, 6, 5], [2, 3, 7, 6], [3, 0, 4, 7]]
-    by_faces = split_polyhedron([[int(numbers[k]) for k in face] for face in faces])
-    by_corners, _, _ = split_solids([Block("hexahedron", numbers[None])], points)
-    assert sorted(map(sorted, by_faces)) == sorted(map(sorted, by_corners.tolist()))
-
-
 def test_polygons():
-    assert fan([7, 3, 9, 5, 8]) == [(3, 9, 5), (3, 5, 8), (3, 8, 7)]
     blocks = [Block("quad", np.array([[5, 2, 8, 9]])), Block("triangle", np.array([[1, 2, 3]]))]
     assert triangles_of(blocks).tolist() == [[2, 8, 9], [2, 9, 5], [1, 2, 3]]

@@ -124,10 +124,10 @@ def test_a_file_format_is_added_as_the_recipe_says(tmp_path):
     (line,) = (block.code for block in blocks if block.language == "text")
     readers = tmp_path / "warp_corot" / "io" / "read"
     (readers / "febio.py").write_text(module, encoding="utf-8")
-    listed = (readers / "files.py").read_text(encoding="utf-8")
+    listed = (readers / "filemesh.py").read_text(encoding="utf-8")
     head = "READERS: dict[str, tuple[Reader, ...]] = {\n"
     assert head in listed
-    (readers / "files.py").write_text(listed.replace(head, head + line), encoding="utf-8")
+    (readers / "filemesh.py").write_text(listed.replace(head, head + line), encoding="utf-8")
     (example,) = (block.code for block in blocks if "write_text" in block.code)
     (tmp_path / "block.feb").write_text(re.search(r'"""(.*?)"""', example, re.DOTALL)[1], encoding="utf-8")
     options = ["--materials", "fat=20kPa:0.45,muscle=50kPa:0.45", "--fix", "bottom", "-o", "block.usd"]

@@ -267,7 +267,7 @@ def test_an_asset_softer_than_it_is_meant_to_be_is_held_by_what_carries_it():
     from argparse import Namespace
 
     from warp_corot.cli.input_mesh import InputMesh
-    from warp_corot.io.read.assets import find_asset
+    from warp_corot.io.read.meshes import find_asset
 
     mesh = wc.TetForest.box((1, 1, 1), 0.1, 0)
     for young, fix in ((None, "y < 0.01"), (3e4, "y < 0.01"), (3e3, None)):

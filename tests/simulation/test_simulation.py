@@ -373,7 +373,6 @@ SIMULATION_MISTAKES = {
     "hooks every half step": (lambda b: wc.Simulation(b).on_step(print, every=0.5), "every is 0.5"),
     "rotation level below the roots": (lambda b: wc.Corotated(rotation_level=-1), "rotation_level is -1"),
     "unknown rotation": (lambda b: wc.Corotated(rotation="qr"), "'byers-xu' or 'svd'"),
-    "unknown stiffness": (lambda b: wc.Corotated(stiffness="full"), "'factored', 'sparse' or 'dense'"),
     "one iteration": (lambda b: wc.Corotated(iterations=1), "iterations is 1"),
     "unknown springs": (lambda b: wc.EdgeStVK(springs="cubic"), "biquadratic"),
     "no such device": (lambda b: wc.SoftBody(b.mesh, RUBBER, device="cuda:77"), "no device 'cuda:77'"),
@@ -404,5 +403,3 @@ def test_tree_rotations_need_a_tree():
     body = wc.SoftBody(wc.TetMesh(forest.points, forest.tets), RUBBER, device="cpu")
     with pytest.raises(wc.InputError, match="needs a forest"):
         wc.Simulation(body, model=wc.Corotated(rotation_level=1))
-    with pytest.raises(wc.InputError, match="needs a forest"):
-        wc.Simulation(body, model=wc.Corotated(stiffness="sparse"))

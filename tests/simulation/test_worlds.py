@@ -11,8 +11,6 @@ import warp_corot as wc
 FOREST_MODELS = [
     wc.Corotated(rotation_level=0),
     wc.Corotated(rotation_level=1),
-    wc.Corotated(stiffness="sparse"),
-    wc.Corotated(stiffness="dense", rotation_level=1),
     wc.Corotated(subtrees=False),
 ]
 ALL_MODELS = [

@@ -55,7 +55,6 @@ COROTATED = [
     wc.Corotated(rotation_level=1),
     wc.Corotated(rotation_level=4),
     wc.Corotated(rotation="svd", rotation_level=2),
-    wc.Corotated(stiffness="sparse"),
     wc.Corotated(subtrees=False),
 ]
 OTHERS = [

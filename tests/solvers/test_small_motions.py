@@ -35,7 +35,6 @@ PATHS = {
     "corotated": (TISSUE, wc.Corotated()),
     "corotated, leaf by leaf": (TISSUE, wc.Corotated(subtrees=False)),
     "corotated, SVD": (TISSUE, wc.Corotated(rotation="svd")),
-    "corotated, explicit stiffness": (TISSUE, wc.Corotated(stiffness="sparse")),
     "rotations shared by 2 leaves": (TISSUE, wc.Corotated(rotation_level=5)),
     "rotations shared by 8 leaves": (TISSUE, wc.Corotated(rotation_level=3)),
     "rotations shared by 16 leaves": (TISSUE, wc.Corotated(rotation_level=2)),

@@ -147,11 +147,10 @@ GMSH_KINDS = {"tetra": 4, "hexahedron": 5, "wedge": 6, "pyramid": 7}
 
 ABAQUS = """\
 *Heading
-** two parts, the second twice
-*Part, name=Block
 *Node
  1, 0., 0., 0.
  2, 1., 0., 0.
+** the others
  3, 1., 1., 0.
  4, 0., 1., 0.
 *Node, nset=top
@@ -162,33 +161,21 @@ ABAQUS = """\
 *Element, type=c3d8r, elset=Whole
  3, 1, 2, 3, 4, 5, 6,
  7, 8
+*Include, input=tip.inp
+*Nset,
+nset=top, generate
+ 5, 8, 1
 *Solid Section, elset=WHOLE, material=Liver
 ,
-*End Part
-*Part, name=Tip
+"""
+ABAQUS_TIP = """\
 *Node
- 10, 0, 0, 0
- 20, 1, 0, 0
- 30, 0, 1, 0
- 40, 0, 0, 1
-*Element, type=C3D4
- 1, 10, 20, 30, 40
+ 10, 0, 0, 2
+ 20, 1, 0, 2
+ 30, 0, 1, 2
+ 40, 0, 0, 3
+*Element, type=C3D4H
+ 4, 10, 20, 30, 40
 *Elset, elset=All, generate
- 1, 1, 1
-*Solid Section,
-elset=All, material=Bone
-*End Part
-*Assembly, name=A
-*Instance, name=one, part=Block
-*End Instance
-*Instance, name=two, part=Tip
- 5., 0., 0.
-*End Instance
-*Instance, name=three, part=Tip
- 0., 0., 1.
- 0., 0., 1., 0., 1., 1., 90.
-*End Instance
-*Elset, elset=Loaded, instance=one
- 3,
-*End Assembly
+ 4, 4, 1
 """

@@ -11,7 +11,7 @@ import numpy as np
 LONG_WORD = "x" * 2000
 _WORDS = """0 1 -1 2 12 300 1e-3 nan inf -inf 1e400 2147483648 99999999999999999999 x mm cm m inch 5kPa 5furlong 1e-300m
 3mm 500ms 1.06g/cm3 0.2:0.4 200 -200:300 200: 9:1 linear corotated warp:bunny warp: box no.stl seed.ply seed.nii
-seed.vtk seed.usda run.toml bad.toml . / out.usd out.usda other.usd out.vtu out.pvd out.xdmf a.png a.gif out.csv
+seed.vtk seed.usda run.toml bad.toml . / out.usd out.usda other.usd out.vtu out.pvd a.png a.gif out.csv
 nowhere/a.usd nowhere/a.csv nowhere/ cpu cuda:9 auto none all bottom top left left+top 1/0<x (((( z<zmin+.01 - -- @run
 NAME=z<0 a=bottom a=a b=nearest(0,0,0,9) 0,0,0 5kPa:0.45 5kPa:0.6 5kPa:0.45:1000:1 liver=3kPa:0.45 2=3kPa:0.45
 2=3kPa:0.45,7=1e4:.3 liver@2=3kPa,bone@7=1GPa:.3 = ,, x=y=z material region tissue nodes,stress hypot(x,y)<1

@@ -273,10 +273,8 @@ def _nibabel(suffix: str) -> Callable[[Path], Path]:
     def make(folder: Path) -> Path:
         import nibabel
 
-        kind = nibabel.Nifti1Image if suffix.startswith(".nii") else nibabel.MGHImage
-        image = kind(_voxels(), np.diag([4.0, 4.0, 4.0, 1.0]))
-        if suffix.startswith(".nii"):
-            image.header.set_xyzt_units("mm")
+        image = nibabel.Nifti1Image(_voxels(), np.diag([4.0, 4.0, 4.0, 1.0]))
+        image.header.set_xyzt_units("mm")
         nibabel.save(image, folder / f"seed{suffix}")
         return folder / f"seed{suffix}"
 
@@ -405,8 +403,6 @@ SEEDS: dict[str, Callable[[Path], Path]] = {
     "f3grid": _meshio(".f3grid"),
     "nii": _nibabel(".nii"),
     "nii.gz": _nibabel(".nii.gz"),
-    "mgh": _nibabel(".mgh"),
-    "mgz": _nibabel(".mgz"),
     "nrrd": _itk(".nrrd"),
     "nrrd-gz": _itk(".nrrd", compress=True),
     "nhdr": _itk(".nhdr"),

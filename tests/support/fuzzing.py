@@ -98,7 +98,7 @@ def prepared(scenes: bool) -> None:
     from warp_corot.body.soft_body import SoftBody
     from warp_corot.cli import bodies, scene, simulate  # noqa: F401 (all modules that read files)
     from warp_corot.domain import surface
-    from warp_corot.io.read import files
+    from warp_corot.io.read import filemesh as files
     from warp_corot.io.write import animate
     from warp_corot.mesh import TetForest
 

@@ -6,7 +6,7 @@ from functools import cache
 import numpy as np
 
 import warp_corot as wc
-from warp_corot.io.read.tetrahedra import load_tets
+from warp_corot.io.read.meshes import load_tets
 
 DENSITY = 1000.0
 GRAVITY = 9.81
@@ -44,7 +44,7 @@ def _plate(count):
 
 def _bear(_):
     bear = load_tets("warp:bear", scale=0.1)
-    return wc.TetMesh(bear.points, bear.tets, up_axis=bear.up_axis)
+    return wc.TetMesh(bear.points, bear.cells, up_axis=bear.up_axis)
 
 
 SHAPES = {

@@ -9,6 +9,7 @@ from warp_corot.kernels.clusters.laws import add_pair, measure_pairs, pair_dilat
 from warp_corot.kernels.clusters.pairs import PairClusters, half_word, pair_forces, record_of
 from warp_corot.kernels.elements.dilatation import VOLUME
 from warp_corot.kernels.elements.elements import load_node
+from warp_corot.kernels.elements.simd8 import law_kernel
 from warp_corot.kernels.tables.cluster_layout import QUAD_BYTES
 
 
@@ -43,7 +44,7 @@ def add_dilatations(scatter, listed, stride, lam, u, sums):
 def dilatations_of_pairs(Pairs):
     dilatations = pair_dilatations(VOLUME)
 
-    @wp.kernel(module="unique")
+    @law_kernel()
     def dilatations_of_pairs(
         clusters: PairClusters,
         pairs: Pairs,
@@ -75,7 +76,7 @@ def dilatations_of_pairs(Pairs):
 def forces_of_pairs(Pairs, Material, law):
     of_pair = pair_forces(law)
 
-    @wp.kernel(module="unique")
+    @law_kernel()
     def forces_of_pairs(
         pairs: Pairs,
         clusters: PairClusters,

@@ -63,7 +63,6 @@ def assert_whole(stage, time, volume):
     rest = np.array(primvars.GetPrimvar("rest").Get(time), float)
     assert len(points) == len(rest) == len(primvars.GetPrimvar("fixed").Get(time))
     assert len(points) == len(tets.GetVelocitiesAttr().Get(time))
-    assert len(points) == len(primvars.GetPrimvar("displayColor").GetIndicesAttr().Get(time))
     assert len(indices) == len(primvars.GetPrimvar("vonMises").Get(time))
     for name in ("young", "poisson", "density"):
         primvar = primvars.GetPrimvar(name)

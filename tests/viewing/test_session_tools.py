@@ -5,8 +5,8 @@ import pytest
 from hands import TOP, block
 
 import warp_corot as wc
+from warp_corot.viewing.commands import TISSUES, present, switched
 from warp_corot.viewing.session import Session
-from warp_corot.viewing.tissue import TISSUES, present, switched
 
 UP = np.array([0.0, 0.0, 0.004])
 

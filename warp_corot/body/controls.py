@@ -18,11 +18,10 @@ import warp as wp
 from warp_corot.discretization.elements import Mesh
 from warp_corot.discretization.sizes import Sizes, vec3_view
 from warp_corot.errors import InputError, depth_of_user
-from warp_corot.inputs.checks import FLOAT32, checked_indices, shown
-from warp_corot.inputs.device import vectors_on_device
+from warp_corot.inputs.checks import FLOAT32, checked_indices, shown, vectors_on_device
 from warp_corot.inputs.selection import CONSTANTS, FUNCTIONS, REGIONS, select_nodes
 from warp_corot.inputs.simulation_lock import under_lock
-from warp_corot.materials.directional import Directional
+from warp_corot.materials.anisotropic import Directional
 from warp_corot.materials.isotropic import Material
 
 from .arrays import Views

@@ -14,9 +14,8 @@ from warp_corot.discretization.discretization import Discretization, FixedMesh, 
 from warp_corot.discretization.elements import Mesh, repeated
 from warp_corot.discretization.sizes import Clock, vec3_view
 from warp_corot.errors import InputError
-from warp_corot.inputs.checks import checked_count, checked_numbers, shown
+from warp_corot.inputs.checks import checked_count, checked_device, checked_numbers, shown
 from warp_corot.inputs.cpu_threads import team_for
-from warp_corot.inputs.device import checked_device
 from warp_corot.inputs.loading import BODY, load
 from warp_corot.inputs.simulation_lock import SIMULATION_LOCK, under_lock
 from warp_corot.kernels.stepping.integrate import RESET_NODES

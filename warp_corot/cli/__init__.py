@@ -12,22 +12,25 @@ from collections.abc import Collection, Sequence
 from importlib import import_module
 from importlib.metadata import version
 from types import ModuleType
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from warp_corot.errors import InputError, UnstableError
 from warp_corot.inputs.arguments import meant
 from warp_corot.inputs.importing import uncollected
 from warp_corot.inputs.stopwatch import WATCH
 
-from .options import COMMANDS, EXIT_CODES, StrictParser, add_command
-from .ranks import end_others, fall_silent, let_others_speak, speaks
+from .options import COMMANDS, EXIT_CODES, add_command
 from .terminal import (
     as_option,
     complain,
+    end_others,
+    fall_silent,
     interrupt_status,
     leaving_at_once,
+    let_others_speak,
     open_streams,
     silence,
+    speaks,
     terminable,
 )
 
@@ -40,13 +43,20 @@ def subcommand(name: str) -> ModuleType:
     return import_module(f".{name.replace('-', '_')}", __name__)
 
 
-class Parser(StrictParser):
-    """Reports errors in one line, and accepts -1e3 as a number."""
+class Parser(argparse.ArgumentParser):
+    """Reports errors in one line, and accepts -1e3 as a number, but neither abbreviations nor ``--`` as a value, which
+    argparse turns into an empty list."""
 
-    def __init__(self, **options):
+    def __init__(self, **options: Any):
+        options.setdefault("allow_abbrev", False)
         options.setdefault("formatter_class", argparse.RawDescriptionHelpFormatter)
         super().__init__(**options)
         self._negative_number_matcher = re.compile(r"^-(\d|\.\d|inf|nan)")
+
+    def _get_values(self, action: argparse.Action, arg_strings: list[str]) -> Any:
+        if action.option_strings and "--" in arg_strings:
+            self.error(f"argument {'/'.join(action.option_strings)}: '--' is not a value")
+        return super()._get_values(action, arg_strings)
 
     def error(self, message: str) -> NoReturn:
         known = re.search(r"invalid choice: '([^']*)' \(choose from (.*)\)$", message)
@@ -156,7 +166,7 @@ def _warn(message: str, said: set[str]) -> None:
     """Print a warning, once."""
     if message not in said:
         said.add(message)
-        complain(message, kind="warning")
+        complain(as_option(message), kind="warning")
 
 
 def configure_warp() -> None:

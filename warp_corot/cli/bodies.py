@@ -5,12 +5,13 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from warp_corot.body.soft_body import SoftBody
+from warp_corot.domain.units import pressure
 from warp_corot.elasticity import MODELS, Corotated, Model
 from warp_corot.errors import InputError
 from warp_corot.holding.choice import supports_of
@@ -19,15 +20,9 @@ from warp_corot.remesh.remeshing import OnlineRemesh
 from warp_corot.simulation.parts import checked_gravity
 
 from .input_file import InputFile, bodies_in, open_input, refuse_options, with_unit
-from .input_mesh import InputMesh, covers_all, find_organ, find_subject, label_material, region_material
-from .options import is_static, stands_free
+from .input_mesh import InputMesh, covers_all, find_organ, find_subject, mixed_material, region_entries
+from .options import is_static
 from .patches import BodyPatches, Load, loads_of, move_patches, probes_body, ramp_of, up_of
-from .summary import pressure
-from .terminal import as_options
-
-if TYPE_CHECKING:
-    from .input_mesh import InputMesh
-    from .patches import BodyPatches
 
 #: A density below this [kg/m^3] is most likely meant in g/cm^3.
 LIGHT = 5.0
@@ -139,6 +134,11 @@ def make_body(body: RunBody, duration: float, *, alone: bool) -> None:
         )
 
 
+def stands_free(args: argparse.Namespace) -> bool:
+    """Whether a ground carries the body in place of fixed nodes."""
+    return args.fix is None and (args.ground is not None or args.drop is not None)
+
+
 def gravity_of(args: argparse.Namespace, subject: InputMesh) -> np.ndarray:
     given = subject.gravity if args.gravity is None else tuple(args.gravity)
     return np.array(checked_gravity(given, subject.mesh.up_axis))
@@ -173,14 +173,13 @@ def _material(
     if young is None:
         young = float(f"{stiffer * subject.young_from_weight(density, args.gravity):.1e}")
         chosen = None if covered else young
-    if subject.labels:
-        material = label_material(subject.mesh, subject.labels, young, poisson, density)
-    else:
-        material = Isotropic(young, poisson, density)
+    material = Isotropic(young, poisson, density)
+    mixed = [(subject.mesh.elements_of(entry.name), entry) for entry in subject.labels]
+    mixed += region_entries(patches.tetrahedra, args.region or ())
+    if mixed:
+        material = mixed_material(material, mixed, len(subject.mesh.tets))
     if args.toughness is not None:
         material = replace(material, toughness=args.toughness)
-    if args.region:
-        material = region_material(subject.mesh, patches.tetrahedra, args.region, material)
     return material, chosen
 
 
@@ -278,15 +277,6 @@ def held_by_default(
 
 # --- ``--remesh`` ----------------------------------------------------------------------------------------------------
 
-#: Names of Python's arguments on the command line.
-REMESH_ARGUMENTS = {
-    "refine_above": "--refine-above",
-    "simplify_below": "--simplify-below",
-    "min_level": "--remesh-levels MIN",
-    "max_level": "--remesh-levels MAX",
-    "every": "--remesh-every",
-    "capacity": "--capacity",
-}
 #: Options that need ``--remesh``.
 REMESH_OPTIONS = ("refine_above", "simplify_below", "remesh_levels", "remesh_every", "capacity")
 
@@ -314,5 +304,4 @@ def remesh_of(args: argparse.Namespace, kind: str) -> OnlineRemesh | None:
     asked = {name: getattr(args, name) for name in ("refine_above", "simplify_below", "capacity")}
     asked |= {"every": args.remesh_every}
     asked |= dict(zip(("min_level", "max_level"), args.remesh_levels or (None, None), strict=True))
-    with as_options(REMESH_ARGUMENTS):
-        return OnlineRemesh(**{name: value for name, value in asked.items() if value is not None})
+    return OnlineRemesh(**{name: value for name, value in asked.items() if value is not None})

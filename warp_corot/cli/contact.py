@@ -1,40 +1,165 @@
-"""What the bodies of a run touch: ``--ground``, ``--drop``, ``--tool``, ``--tool-path`` and ``--touch``; blades."""
+"""What the bodies of a run touch: grounds, tools and their paths; blades that cut them."""
 
 from __future__ import annotations
 
 import argparse
+import csv
 import math
-from collections.abc import Sequence
+import re
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
 from warp_corot.contact.options import Contact, checked_friction
-from warp_corot.contact.shapes import Capsule, Cylinder, Ground
+from warp_corot.contact.shapes import Box, Capsule, Cylinder, Ground, Shape, Sphere
 from warp_corot.contact.skin import own_surface
 from warp_corot.contact.tool import Obstacle, Tool
-from warp_corot.domain.units import length
+from warp_corot.cutting.blade import Blade
+from warp_corot.domain.units import in_units, length
 from warp_corot.errors import InputError
 from warp_corot.solvers import INTEGRATORS
 
-from .options import AUTO, integrator_name
+from .options import integrator_name
 from .patches import up_of
-from .ranks import are_several
-from .tool_paths import make_tool
+from .quantities import AUTO
+from .terminal import are_several
 
 if TYPE_CHECKING:
     from warp_corot.simulation.simulation import Simulation
 
     from .bodies import RunBody
 
+#: Shapes by name, each with the names of the lengths that it takes.
+SHAPES: dict[str, tuple[Callable[..., Shape], str]] = {
+    "sphere": (Sphere, "r"),
+    "capsule": (Capsule, "rl"),
+    "cylinder": (Cylinder, "rl"),
+    "box": (lambda *size, **more: Box(size, **more), "xyz"),
+}
+FORMS = "sphere:r=R, capsule:r=R,l=L, cylinder:r=R,l=L or box:x=X,y=Y,z=Z, for example capsule:r=4mm,l=100mm"
+#: Columns of a path, and their units.
+POSITION = {"time": "s", "x": "m", "y": "m", "z": "m"}
+COLUMNS = POSITION | dict.fromkeys(("qx", "qy", "qz", "qw"), "")
+KNOWN = "time, x, y, z, and for turns also qx, qy, qz, qw"
+_HEADER = re.compile(r"\s*([A-Za-z_]+)\s*(?:[\[(]\s*([^\])]+?)\s*[\])])?\s*")
+
+Floats = npt.NDArray[np.float64]
+AnyTool = TypeVar("AnyTool", bound=Tool)
+
+
+def tool_shape(text: str) -> Shape:
+    """A shape at the origin from the text of ``--tool``.
+
+    Raises:
+        InputError: Another form, a length that is not positive, or a negative friction.
+    """
+    kind, _, rest = text.partition(":")
+    kind = kind.strip().lower()
+    try:
+        if kind not in SHAPES:
+            raise InputError(f"{kind!r} is not a shape")
+        make, names = SHAPES[kind]
+        pairs = [[part.strip() for part in word.split("=", 1)] for word in rest.split(",")]
+        given = {pair[0].lower(): pair[-1] for pair in pairs}
+        friction = given.pop("friction", None)
+        if set(given) != set(names) or len(pairs) != len(names) + (friction is not None):
+            raise InputError(f"a {kind} has {', '.join(names)}, each once")
+        lengths = (in_units(given[name], "m") for name in names)
+        return make(*lengths, **({} if friction is None else {"friction": float(friction)}))
+    except (InputError, ValueError) as error:
+        raise InputError(f"--tool {text!r}: {error}; it must be {FORMS}") from None
+
+
+def make_blade(path: Path, length: float) -> Blade:
+    """A straight blade of this length [m] that moves along the path in a file; see ``_moved``."""
+    return _moved(Blade([(0.0, 0.0, -0.5 * length), (0.0, 0.0, 0.5 * length)]), path)
+
+
+def _moved(tool: AnyTool, path: Path) -> AnyTool:
+    """A tool that moves along the path in a file; with a single row it stays there.
+
+    Raises:
+        InputError: The file cannot be read, or its rows are not a path.
+    """
+    times, positions, turns = read_tool_path(path)
+    try:
+        if len(times) == 1:
+            tool.move(positions[0], None if turns is None else turns[0])
+        else:
+            tool.follow(times, positions, turns)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+    return tool
+
+
+def read_tool_path(path: Path) -> tuple[Floats, Floats, Floats | None]:
+    """Times [s], [K], positions [m], [K, 3], and quaternions (x, y, z, w), [K, 4], or None without.
+
+    The first row names the columns, with optional units ("x [mm]"); without names there are four or eight columns in
+    the order of `COLUMNS`.
+
+    Raises:
+        InputError: No such file, other columns, or a value that is not a finite number.
+    """
+    try:
+        with path.open(encoding="utf-8-sig", newline="") as file:
+            rows = [(number, row) for number, row in enumerate(csv.reader(file), 1) if any(map(str.strip, row))]
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file (--tool-path)") from None
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise InputError(f"{path}: cannot be read as CSV ({error})") from None
+    if not rows:
+        raise InputError(f"{path}: is empty; it must have rows of {KNOWN}")
+    units = dict.fromkeys(list(COLUMNS)[: len(rows[0][1])], 1.0)
+    if rows[0][1][0].strip()[:1].isalpha():
+        units = _named_columns(rows.pop(0)[1], path)
+    missing = [name for name in (COLUMNS if units.keys() - POSITION else POSITION) if name not in units]
+    if missing or not rows:
+        lacks = f"column {missing[0]!r}" if missing else "rows"
+        raise InputError(f"{path}: has no {lacks}; it must have rows of {KNOWN}")
+    values = np.empty((len(rows), len(units)))
+    for place, (number, row) in enumerate(rows):
+        if len(row) != len(units):
+            raise InputError(f"{path}: line {number} has {len(row)} values; it must have {len(units)}")
+        for column, (text, (name, unit)) in enumerate(zip(row, units.items(), strict=True)):
+            try:
+                values[place, column] = unit * float(text)
+            except ValueError:
+                values[place, column] = math.nan
+            if not math.isfinite(values[place, column]):
+                raise InputError(f"{path}: line {number}: {name} is {text.strip()!r}; it must be a finite number")
+    of = dict(zip(units, values.T, strict=True))
+    turns = np.stack([of[name] for name in ("qx", "qy", "qz", "qw")], axis=1) if "qw" in of else None
+    return of["time"], np.stack([of[axis] for axis in "xyz"], axis=1), turns
+
+
+def _named_columns(row: list[str], path: Path) -> dict[str, float]:
+    """The columns that a row names, each with its unit in SI units.
+
+    Raises:
+        InputError: Other names or units.
+    """
+    found: dict[str, float] = {}
+    for word in row:
+        match = _HEADER.fullmatch(word)
+        name = {"t": "time"}.get(match[1].lower(), match[1].lower()) if match else word
+        if not match or name not in COLUMNS or name in found:
+            raise InputError(f"{path}: has a column {word.strip()!r}; its columns must be {KNOWN}")
+        try:
+            found[name] = in_units(f"1 {match[2]}", COLUMNS[name]) if match[2] and name in POSITION else 1.0
+        except InputError as error:
+            raise InputError(f"{path}: column {word.strip()!r}: {error}") from None
+    return found
+
+
 #: Overlaps below this fraction of a body's height are rounding and are not reported.
 SMALL = 1e-5
 #: Tetrahedra that reach farther than this beyond the surface, relative to the height of the body, are said.
 FAR = 0.01
-
-Floats = npt.NDArray[np.float64]
 
 
 @dataclass(eq=False)
@@ -92,7 +217,7 @@ def touched_by(options: Sequence[argparse.Namespace]) -> RunContact:
     if isinstance(shared.ground, float) and not math.isfinite(shared.ground):
         raise InputError(f"--ground is {shared.ground:g} m; it must be a finite height or auto")
     tools: dict[str, Obstacle] = {
-        f"tool {place}": make_tool(shape, path)
+        f"tool {place}": _moved(Tool(tool_shape(shape)), path)
         for place, (shape, path) in enumerate(zip(shapes, paths, strict=True), 1)
     }
     friction = Contact().friction if shared.friction is None else shared.friction

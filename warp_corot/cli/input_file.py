@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -14,10 +13,16 @@ import numpy.typing as npt
 from warp_corot.domain.units import length, likely_unit, metres_per_unit, unlikely_size
 from warp_corot.errors import InputError
 from warp_corot.io.read import FileMesh
-from warp_corot.io.read.assets import Asset, find_asset
-from warp_corot.io.read.surfaces import LoadedSurface, load_surface, read_file
-from warp_corot.io.read.tetrahedra import LoadedMesh, check_file, load_tets
-from warp_corot.io.read.volumes import LoadedVolume, volume_of_image
+from warp_corot.io.read.filemesh import LoadedVolume, volume_of_image
+from warp_corot.io.read.meshes import (
+    Asset,
+    LoadedMesh,
+    check_file,
+    find_asset,
+    load_surface,
+    load_tets,
+    read_file,
+)
 
 from .options import TETS
 
@@ -40,7 +45,7 @@ class InputFile:
     kind: str
     asset: Asset | None = None
     found: FileMesh | None = None
-    loaded: LoadedMesh | LoadedSurface | LoadedVolume | None = None
+    loaded: LoadedMesh | LoadedVolume | None = None
     notes: list[str] = field(default_factory=list)
     unit: str | float | None = None
 
@@ -92,16 +97,13 @@ def with_unit(opened: InputFile, args: argparse.Namespace) -> InputFile:
     """
     if args.scale is not None and not 0.0 < args.scale < np.inf:
         raise InputError(f"scale is {args.scale:g}; it must be a positive number")
-    named: str | float | None = None
     loaded = opened.loaded
     if opened.kind == "tets":
-        given = None if args.unit is None else metres_per_unit(args.unit)
-        loaded = load_tets(opened.name, unit=given, regions=args.regions_by, found=opened.found)
+        loaded = load_tets(opened.name, unit=1.0, regions=args.regions_by, found=opened.found)
         opened = replace(opened, loaded=loaded)
     if isinstance(loaded, LoadedMesh):
-        size, named = _longest(loaded.points, loaded.tets), 1.0 if loaded.says_unit else None
-    elif isinstance(loaded, LoadedSurface):
-        size, named = _longest(loaded.points, loaded.triangles), loaded.metres
+        named: str | float | None = loaded.metres
+        size = longest_side(loaded.points[np.unique(loaded.cells)])
     elif isinstance(loaded, LoadedVolume):
         steps = np.linalg.norm(loaded.affine[:3, :3], axis=0)
         size, named = float((loaded.values.shape * steps).max()), loaded.unit
@@ -128,10 +130,8 @@ def placed(opened: InputFile, args: argparse.Namespace) -> Any:
     loaded, asset, offset = opened.loaded, opened.asset, offset_of(args)
     scale = 1.0 if args.scale is None else args.scale
     as_asset = asset is not None and args.scale is None and args.unit is None
-    if isinstance(loaded, LoadedMesh):
-        if args.unit is None and not loaded.says_unit and not asset:
-            scale *= metres_per_unit(opened.unit or 1.0)
-        scale = asset.scale if asset and as_asset else scale
+    if isinstance(loaded, LoadedMesh) and not loaded.is_surface:
+        scale = (asset.scale if asset and as_asset else scale) * metres_per_unit(opened.unit or 1.0)
         opened.notes += loaded.notes
         return replace(loaded, points=loaded.points * scale + offset, up_axis=args.up or loaded.up_axis)
     assert loaded is not None
@@ -157,69 +157,7 @@ def longest_side(points: np.ndarray) -> float:
         return float(np.ptp(points, axis=0).max()) if len(points) else 0.0
 
 
-def _longest(points: np.ndarray, cells: np.ndarray) -> float:
-    """The longest side of the box around the points that cells name."""
-    return longest_side(points[np.unique(cells)])
-
-
 # --- an option without effect on this input is refused, with the reason ----------------------------------------------
-
-
-class Rule(NamedTuple):
-    """A rule for when options have an effect.
-
-    Attributes:
-        options: Their names in Python.
-        applies: Whether they have an effect, given the command's arguments and the input.
-        purpose: Their purpose, to follow "--NAME is for".
-    """
-
-    options: tuple[str, ...]
-    applies: Callable[[argparse.Namespace, InputFile], bool]
-    purpose: str
-
-
-RULES = (
-    Rule(
-        ("skin",),
-        lambda args, opened: opened.kind == "surface" or (opened.kind == "scan" and args.skin == "marched"),
-        "surfaces",
-    ),
-    Rule(("level",), lambda _, opened: opened.kind != "tets", "the box, surfaces and scans"),
-    Rule(("unit", "up"), lambda _, opened: opened.kind != "box", "files"),
-    Rule(("rotation_level",), lambda _, opened: opened.kind != "tets", "box, surfaces and scans"),
-    Rule(
-        ("join",),
-        lambda args, opened: opened.kind == "tets" or len(getattr(opened.loaded, "objects", ())) > 1,
-        "surfaces of several objects and meshes of tetrahedra",
-    ),
-    Rule(("labels", "smoothing"), lambda _, opened: opened.kind == "scan", "scans"),
-    Rule(
-        ("threshold",),
-        lambda args, opened: opened.kind == "scan" and args.labels is None and args.materials is None,
-        "scans without --labels and --materials",
-    ),
-    Rule(
-        ("cell_size", "max_level", "surface_error", "tets", "min_layers", "draw_tets"),
-        lambda _, opened: opened.kind in ("surface", "scan"),
-        "surfaces and scans",
-    ),
-    Rule(
-        ("materials",),
-        lambda args, opened: (opened.kind == "scan" and args.labels is None) or opened.has_regions,
-        "scans without --labels and meshes of tetrahedra whose file numbers regions",
-    ),
-    Rule(
-        ("regions_by",),
-        lambda args, opened: args.materials is not None and opened.has_regions,
-        "--materials on meshes of tetrahedra whose file numbers regions",
-    ),
-    Rule(
-        ("draw_labels",),
-        lambda args, opened: opened.has_regions or opened.kind == "scan",
-        "scans and meshes of tetrahedra whose file numbers regions",
-    ),
-)
 
 
 def refuse_options(args: argparse.Namespace, opened: InputFile) -> None:
@@ -228,15 +166,32 @@ def refuse_options(args: argparse.Namespace, opened: InputFile) -> None:
     Raises:
         InputError: An option has none; the message names it and its purpose.
     """
-    for rule in RULES:
-        for name in rule.options:
-            given = getattr(args, name, None)
-            if given is not None and given is not False and not rule.applies(args, opened):
-                option = f"--{name.replace('_', '-')}"
-                instead = "; use --scale" if name == "unit" else ""
-                raise InputError(f"{option} is for {rule.purpose}, and {args.input} is not one{instead}")
-    if opened.kind != "box" and args.level is not None and (args.tets is not None or args.max_level is not None):
-        raise InputError("--level is given, with which neither --tets nor --max-level has an effect")
+    is_scan, regions = opened.kind == "scan", opened.has_regions
+    is_organ, is_forest = opened.kind in ("surface", "scan"), opened.kind != "tets"
+    organs, forests, numbered = "surfaces and scans", "box, surfaces and scans", "tetrahedra whose file numbers regions"
+    rules = {
+        "skin": (opened.kind == "surface" or (is_scan and args.skin == "marched"), "surfaces"),
+        "level": (is_forest, forests),
+        "rotation_level": (is_forest, forests),
+        "unit": (opened.kind != "box", "files"),
+        "up": (opened.kind != "box", "files"),
+        "join": (not is_forest or len(getattr(opened.loaded, "objects", ())) > 1, "several objects and tetrahedra"),
+        "labels": (is_scan, "scans"),
+        "smoothing": (is_scan, "scans"),
+        "threshold": (is_scan and args.labels is args.materials is None, "scans without --labels and --materials"),
+        "tets": (is_organ, organs),
+        "min_layers": (is_organ, organs),
+        "draw_tets": (is_organ, organs),
+        "materials": ((is_scan and args.labels is None) or regions, f"scans without --labels and {numbered}"),
+        "regions_by": (args.materials is not None and regions, f"--materials on {numbered}"),
+        "draw_labels": (is_scan or regions, f"scans and {numbered}"),
+    }
+    for name, (applies, purpose) in rules.items():
+        if getattr(args, name, None) not in (None, False) and not applies:
+            instead = "; use --scale" if name == "unit" else ""
+            raise InputError(f"--{name.replace('_', '-')} is for {purpose}, and {args.input} is not one{instead}")
+    if opened.kind != "box" and args.level is not None and args.tets is not None:
+        raise InputError("--level is given, with which --tets has no effect")
     if args.labels is not None and args.young is not None:
         raise InputError("--young is given, but --labels gives each label its own")
     if args.draw_labels and args.labels is None and args.materials is None:
@@ -261,16 +216,16 @@ def bodies_in(opened: InputFile, args: argparse.Namespace) -> list[tuple[InputFi
     tetrahedra are separate bodies, too.
     """
     loaded = opened.loaded
-    several = isinstance(loaded, LoadedMesh | LoadedSurface) and 2 <= len(loaded.objects) <= MOST_BODIES
+    several = isinstance(loaded, LoadedMesh) and 2 <= len(loaded.objects) <= MOST_BODIES
     if args.join or not several:
         return [(opened, args)]
-    assert isinstance(loaded, LoadedMesh | LoadedSurface)
+    assert isinstance(loaded, LoadedMesh)
     parts, shares = _parts(loaded), np.zeros(0)
-    if isinstance(loaded, LoadedSurface):
+    if loaded.is_surface:
         from warp_corot.domain.closing import close_surface
 
         try:
-            whole, *closed = (close_surface(part.points, part.triangles) for part in (loaded, *parts))
+            whole, *closed = (close_surface(part.points, part.cells) for part in (loaded, *parts))
         except InputError:
             return [(opened, args)]
         if whole.cavities or any(part.caps for part in closed):
@@ -279,41 +234,29 @@ def bodies_in(opened: InputFile, args: argparse.Namespace) -> list[tuple[InputFi
         shares /= shares.sum()
     names = ", ".join(part.name for part in parts[:8]) + (", ..." if len(parts) > 8 else "")
     opened.notes.append(f"{len(parts)} separate bodies: {names} (--join makes them one)")
-    fineness = (args.level, args.max_level, args.surface_error, args.cell_size)
     found = []
     for place, part in enumerate(parts):
         own = argparse.Namespace(**vars(args))
-        if len(shares) and (args.tets is not None or all(given is None for given in fineness)):
+        if len(shares) and args.level is None:
             own.tets = max(FEWEST_TETS, int((args.tets or TETS) * shares[place]))
         found.append((replace(opened, loaded=part, notes=opened.notes if place == 0 else []), own))
     return found
 
 
-def _parts(loaded: LoadedMesh | LoadedSurface) -> list[Any]:
+def _parts(loaded: LoadedMesh) -> list[LoadedMesh]:
     """The objects of a file, which share no nodes."""
-    cells = loaded.tets if isinstance(loaded, LoadedMesh) else loaded.triangles
+    cells, parts = loaded.cells, list[LoadedMesh]()
     ends = np.cumsum([count for _, count in loaded.objects])
-    parts: list[LoadedMesh | LoadedSurface] = []
     for (name, count), chosen in zip(loaded.objects, np.split(np.arange(len(cells)), ends[:-1]), strict=True):
         if not count:
             continue
         used, renumbered = np.unique(cells[chosen], return_inverse=True)
         own = np.asarray(renumbered.reshape(-1, cells.shape[1]), dtype=np.int32)
-        part = replace(loaded, points=loaded.points[used], name=name, objects=[])
-        if isinstance(part, LoadedSurface):
-            parts.append(replace(part, triangles=own))
-            continue
-        sets = {known: np.flatnonzero(np.isin(used, nodes)) for known, nodes in part.node_sets.items()}
-        regions = part.regions
-        parts.append(
-            replace(
-                part,
-                tets=own,
-                regions=None if regions is None else replace(regions, of_tet=regions.of_tet[chosen]),
-                notes=[] if parts else part.notes,
-                node_sets={known: nodes for known, nodes in sets.items() if len(nodes)},
-            )
-        )
+        sets = {known: np.flatnonzero(np.isin(used, nodes)) for known, nodes in loaded.node_sets.items()}
+        regions = loaded.regions and replace(loaded.regions, of_tet=loaded.regions.of_tet[chosen])
+        sets = {known: nodes for known, nodes in sets.items() if len(nodes)}
+        about: dict[str, Any] = {"regions": regions, "node_sets": sets, "notes": [] if parts else loaded.notes}
+        parts.append(replace(loaded, points=loaded.points[used], cells=own, name=name, objects=[], **about))
     return parts
 
 

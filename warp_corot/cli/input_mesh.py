@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import math
 import re
 import warnings
 from collections.abc import Callable, Sequence
@@ -17,23 +16,19 @@ from warp_corot.body.controls import named_nodes
 from warp_corot.domain.units import in_units
 from warp_corot.errors import InputError
 from warp_corot.inputs.stopwatch import WATCH
-from warp_corot.io.read.surfaces import LoadedSurface
-from warp_corot.io.read.tetrahedra import LoadedMesh
+from warp_corot.io.read.meshes import LoadedMesh
 from warp_corot.materials.isotropic import Isotropic
 from warp_corot.mesh import TetForest, TetMesh
 from warp_corot.mesh.lattice import checked_level
 
 from .input_file import InputFile, merged_nodes, offset_of, placed
-from .options import BOX_LEVEL, CUBES_OF_LEVEL, LABEL, MAX_LEVEL_FOR_ERROR, STIFFNESS_PER_WEIGHT, TETS
-from .terminal import as_options
+from .options import BOX_LEVEL, CUBES_OF_LEVEL, LABEL, STIFFNESS_PER_WEIGHT, TETS
 
 if TYPE_CHECKING:
-    from warp_corot.discretization.elements import Mesh
     from warp_corot.domain import Domain
     from warp_corot.domain.fidelity import Fidelity
-    from warp_corot.io.read.assets import Asset
-    from warp_corot.io.read.regions import Regions
-    from warp_corot.io.read.volumes import LoadedVolume
+    from warp_corot.io.read.filemesh import LoadedVolume
+    from warp_corot.io.read.meshes import Asset, Regions
     from warp_corot.io.write.skins import OwnSurface
     from warp_corot.mesh import SurfaceMesh
 
@@ -131,7 +126,7 @@ def find_subject(opened: InputFile, args: argparse.Namespace) -> InputMesh:
         x, y, z = offset_of(args).tolist()
         return box_subject(TetForest.box(CELLS, CELL_SIZE * (args.scale or 1.0), level, origin=(x, y, z)))
     loaded: LoadedMesh = placed(opened, args)
-    points, tets = loaded.points, loaded.tets
+    points, tets = loaded.points, loaded.cells
     sets = {name: np.isin(np.arange(len(points)), nodes) for name, nodes in loaded.node_sets.items()}
     if args.join:
         points, tets, sets = _joined(loaded, sets, opened.notes)
@@ -141,7 +136,7 @@ def find_subject(opened: InputFile, args: argparse.Namespace) -> InputMesh:
             raise InputError("its arrays number no regions, so that --materials has no effect")
         names, entries = of_regions(entries, found) if found is not None else ((), entries)
         labels = None if found is None else found.of_tet
-        mesh = TetMesh(points, tets, up_axis=loaded.up_axis, labels=labels, label_names=names, node_sets=sets)
+        mesh = TetMesh(points, tets, up_axis=loaded.up_axis or "Z", labels=labels, label_names=names, node_sets=sets)
     except InputError as error:
         raise InputError(f"{loaded.source}: {error}") from None
     subject = InputMesh(mesh, loaded.name, loaded.source, labels=entries, notes=opened.notes)
@@ -167,7 +162,7 @@ def _joined(
     Raises:
         InputError: There are no coincident nodes.
     """
-    points, tets, place = merged_nodes(loaded.points, loaded.tets)
+    points, tets, place = merged_nodes(loaded.points, loaded.cells)
     merged = len(place) - len(points)
     if not merged and not loaded.objects:
         raise InputError(f"{loaded.source}: no two nodes coincide, so that --join has no effect")
@@ -197,18 +192,8 @@ def box_subject(mesh: TetForest) -> InputMesh:
 
 # --- surfaces and scans, which have no tetrahedra --------------------------------------------------------------------
 
-#: With a surface error or a level instead of a number of tetrahedra: the default number for each root cube in a cube of
-#: the body's length, which gives the size of root cubes.
-TETS_PER_CUBE = 30
-#: With a surface error: the number of further levels for details between nodes.
-DETAIL = 6
 #: Root cubes extend beyond the body by this fraction of its length.
 MARGIN = 1.0e-3
-#: Names of Python's arguments on the command line.
-ARGUMENTS = {
-    name: f"--{name.replace('_', '-')}"
-    for name in ("unit", "cell_size", "max_level", "surface_error", "min_layers", "smoothing")
-} | {"target_elements": "--tets"}
 #: A scan with more distinct values, or with negative ones, holds intensities, not labels.
 MOST_LABELS = 256
 #: Number of voxels that are checked for this.
@@ -225,16 +210,15 @@ def find_organ(opened: InputFile, args: argparse.Namespace) -> InputMesh:
     Raises:
         InputError: It encloses no body, or an option is out of its range.
     """
-    with as_options(ARGUMENTS):
-        started = WATCH.clock()
-        entries: list[LabelMaterial] = []
-        domain = domain_of(opened, args, entries)
-        meshing = WATCH.clock()
-        mesh = _mesh(args, domain)
-        surface = mesh.surface()
-        done = WATCH.clock()
-        measured = _measured(args, mesh, domain, surface)
-        skin = _own_surface(opened, args, domain)
+    started = WATCH.clock()
+    entries: list[LabelMaterial] = []
+    domain = domain_of(opened, args, entries)
+    meshing = WATCH.clock()
+    mesh = _mesh(args, domain)
+    surface = mesh.surface()
+    done = WATCH.clock()
+    measured = _measured(mesh, domain, surface)
+    skin = _own_surface(opened, args, domain)
     asset, loaded = opened.asset, opened.loaded
     assert loaded is not None
     subject = InputMesh(
@@ -261,15 +245,6 @@ def domain_of(opened: InputFile, args: argparse.Namespace, entries: list[LabelMa
     if opened.kind == "scan":
         return _scan(opened, args, entries)
     return Domain.from_surface(placed(opened, args), unit=opened.unit, device=args.device)
-
-
-def fineness_of(args: argparse.Namespace, domain: Domain) -> dict[str, Any]:
-    """The arguments of ``from_domain`` for a level."""
-    size = args.cell_size
-    if size is None:
-        size = float(np.ptp(domain.bounds, axis=0).max()) * (1.0 + MARGIN) / CUBES_OF_LEVEL
-    checked_level(args.level, "--level")
-    return {"cell_size": size, "max_level": args.level, "surface_error": args.surface_error, "device": args.device}
 
 
 def _scan(opened: InputFile, args: argparse.Namespace, entries: list[LabelMaterial]) -> Domain:
@@ -323,39 +298,21 @@ def _see_labels(volume: LoadedVolume) -> None:
 
 def _mesh(args: argparse.Namespace, domain: Domain) -> TetForest:
     if args.level is not None:
-        return TetForest.from_domain(domain, **fineness_of(args, domain))
-    count = args.tets
-    if count is None and args.max_level is None and args.surface_error is None:
-        count = TETS
-    size, level, detail = args.cell_size, args.max_level, 0
-    if count is None:
-        detail = DETAIL
-        if size is None:
-            cubes = max(1, round((TETS / TETS_PER_CUBE) ** (1.0 / 3.0)))
-            size = float(np.ptp(domain.bounds, axis=0).max()) * (1.0 + MARGIN) / cubes
-        if level is None:
-            level = MAX_LEVEL_FOR_ERROR
+        checked_level(args.level, "--level")
+        size = float(np.ptp(domain.bounds, axis=0).max()) * (1.0 + MARGIN) / CUBES_OF_LEVEL
+        return TetForest.from_domain(domain, size, max_level=args.level, device=args.device)
+    count = TETS if args.tets is None else args.tets
     layers = {} if args.min_layers is None else {"min_layers": args.min_layers}
     try:
-        return TetForest.from_domain(
-            domain,
-            size,
-            max_level=level,
-            surface_error=args.surface_error,
-            target_elements=count,
-            detail=detail,
-            device=args.device,
-            **layers,
-        )
+        return TetForest.from_domain(domain, target_elements=count, device=args.device, **layers)
     except InputError as error:
-        unsaid = count is not None and count >= 1 and args.surface_error is None and "target_elements" not in str(error)
-        with_tets = f"with --tets {count}, " if unsaid else ""
-        raise InputError(f"{with_tets}{error}") from None
+        said = count < 1 or "target_elements" in str(error)
+        raise InputError(f"{'' if said else f'with --tets {count}, '}{error}") from None
 
 
 def _own_surface(opened: InputFile, args: argparse.Namespace, domain: Domain) -> OwnSurface | None:
     """The input surface, if it is to be drawn."""
-    if not isinstance(opened.loaded, LoadedSurface) or args.skin == "marched":
+    if not isinstance(opened.loaded, LoadedMesh) or args.skin == "marched":
         return None
     from warp_corot.io.write.skins import OwnSurface
 
@@ -365,27 +322,14 @@ def _own_surface(opened: InputFile, args: argparse.Namespace, domain: Domain) ->
     return found
 
 
-def _measured(args: argparse.Namespace, mesh: TetForest, domain: Domain, surface: SurfaceMesh) -> Fidelity:
+def _measured(mesh: TetForest, domain: Domain, surface: SurfaceMesh) -> Fidelity:
     """Measure how well the mesh approximates the body, and warn of deviations."""
     from warp_corot.domain.fidelity import fidelity
-    from warp_corot.domain.units import length
 
     found = fidelity(mesh, domain, surface=surface)
     for doubt in found.doubts():
         said = doubt.replace("more tetrahedra", f"more tetrahedra (--tets {2 * len(mesh.tets)})")
         warnings.warn(said, stacklevel=2)
-    off = max(found.distance_95)
-    if args.surface_error is not None and off > args.surface_error:
-        helps = (
-            "a larger --tets"
-            if args.tets is not None
-            else f"--{'max-' * (args.level is None)}level {int(mesh.levels.max()) + 3}"
-        )
-        warnings.warn(
-            f"--surface-error is {length(args.surface_error)}, and 95 % of the surface are within {length(off)}; "
-            f"{helps} would bring it nearer",
-            stacklevel=2,
-        )
     return found
 
 
@@ -430,43 +374,24 @@ def parse_labels(text: str, option: str = "--labels") -> list[LabelMaterial]:
     return found
 
 
-def parse_pressure(text: str) -> float:
-    """A pressure [Pa] from "3kPa", "0.1 MPa" or "500".
-
-    Raises:
-        InputError: Not a number, or another unit.
-    """
-    return _quantity(text, "Pa", "Young's modulus", "500, 3kPa or 0.1MPa")
-
-
 def _entry(part: str, option: str, form: str | None = None) -> LabelMaterial:
     match = _ENTRY.fullmatch(part)
     values = match["values"].split(":") if match else []
     if not match or not 1 <= len(values) <= 3:
-        raise InputError(form or f"{option} {part.strip()!r}: it must be {LABEL}, for example3kPa:0.45=3kPa:0.45")
+        raise InputError(form or f"{option} {part.strip()!r}: it must be {LABEL}, for example liver=3kPa:0.45")
     name = match["name"]
     numbers = tuple(int(number) for number in (match["numbers"] or "").split("+") if number)
     if not numbers and name.isdecimal():
         numbers = (int(name),)
+    found: list[Any] = [None, None]
     try:
-        young = parse_pressure(values[0])
-        poisson = _quantity(values[1], "", "Poisson's ratio", "0.45") if len(values) > 1 else None
-        density = _quantity(values[2], "kg/m^3", "density", "1060 or 1.06g/cm3") if len(values) > 2 else None
-        Isotropic(young, 0.0 if poisson is None else poisson, 1.0 if density is None else density)
+        found = [in_units(value, unit) for value, unit in zip(values, ("Pa", "", "kg/m^3"), strict=False)] + found
+        young, poisson, density = found[:3]
+        Isotropic(young, poisson or 0.0, 1.0 if density is None else density)
     except InputError as error:
         said = f"{option} {part.strip()!r}" if form is None else form.split(": it must")[0]
         raise InputError(f"{said}: {error}") from None
     return LabelMaterial(name, numbers, young, poisson, density)
-
-
-def _quantity(text: str, unit: str, what: str, such_as: str) -> float:
-    try:
-        value = in_units(text, unit)
-    except InputError:
-        value = math.nan
-    if not math.isfinite(value):
-        raise InputError(f"{what} is {text.strip()!r}; it must be a value like {such_as}")
-    return value
 
 
 def numbers_by_name(
@@ -531,28 +456,6 @@ def of_regions(entries: Sequence[LabelMaterial], regions: Regions) -> tuple[tupl
     return tuple(names), found
 
 
-def label_material(
-    mesh: TetForest | TetMesh, entries: Sequence[LabelMaterial], young: float, poisson: float, density: float
-) -> Isotropic:
-    """The material of each element by its label.
-
-    Args:
-        mesh: A mesh with labels.
-        entries: Materials by label.
-        young: Young's modulus [Pa] of elements without a label, or whose label has no entry.
-        poisson: Poisson's ratio of these elements, and of entries without one.
-        density: Density [kg/m^3] of these elements, and of entries without one.
-    """
-    of_label = {name: number for number, name in enumerate(mesh.label_names, start=1)}
-    table = np.repeat([[young], [poisson], [density]], len(mesh.label_names) + 1, axis=1)
-    for entry in entries:
-        own = (entry.poisson, poisson), (entry.density, density)
-        table[:, of_label[entry.name]] = [entry.young, *(default if given is None else given for given, default in own)]
-    assert mesh.labels is not None
-    youngs, poissons, densities = table[:, mesh.labels]
-    return Isotropic(youngs, poissons, densities)
-
-
 def covers_all(mesh: TetForest | TetMesh, entries: Sequence[LabelMaterial]) -> bool:
     """Whether each element's label has an entry."""
     assert mesh.labels is not None
@@ -560,29 +463,38 @@ def covers_all(mesh: TetForest | TetMesh, entries: Sequence[LabelMaterial]) -> b
     return all(number and mesh.label_names[number - 1] in named for number in np.unique(mesh.labels).tolist())
 
 
-def region_material(
-    mesh: Mesh, inside: Callable[[str], np.ndarray], regions: Sequence[Sequence[str]], base: Isotropic
-) -> Isotropic:
-    """The material with those that ``--region`` gives to tetrahedra.
+def region_entries(
+    inside: Callable[[str], np.ndarray], regions: Sequence[Sequence[str]]
+) -> list[tuple[np.ndarray, LabelMaterial]]:
+    """The tetrahedra, bool [T], and the material of each ``--region``.
 
     Args:
-        mesh: The body's mesh.
         inside: Which tetrahedra are in a patch, bool [T].
-        regions: Pairs of a patch and ``YOUNG[:POISSON[:DENSITY]]``; the last one that contains a tetrahedron is used.
-        base: The material of other tetrahedra, and the source of omitted values.
+        regions: Pairs of a patch and ``YOUNG[:POISSON[:DENSITY]]``.
 
     Raises:
         InputError: Another form, or no tetrahedron in a region.
     """
-    count = len(mesh.tets)
-    values = [np.array(np.broadcast_to(value, count)) for value in (base.young, base.poisson, base.density)]
+    found = []
     for expression, text in regions:
         option = f"--region {expression!r} {text!r}"
         entry = _entry(f"region={text}", "--region", f"{option}: it must be PATCH YOUNG[:POISSON[:DENSITY]]")
-        chosen = inside(expression)
-        if not chosen.any():
+        found.append((inside(expression), entry))
+        if not found[-1][0].any():
             raise InputError(f"--region {expression!r}: there is no tetrahedron in it")
+    return found
+
+
+def mixed_material(base: Isotropic, chosen: Sequence[tuple[np.ndarray, LabelMaterial]], count: int) -> Isotropic:
+    """A material with others in some of ``count`` tetrahedra.
+
+    Args:
+        base: The material of other tetrahedra, and the source of omitted values.
+        chosen: Tetrahedra, bool [T], and their material; the last one that contains a tetrahedron is used.
+    """
+    values = [np.array(np.broadcast_to(value, count)) for value in (base.young, base.poisson, base.density)]
+    for inside, entry in chosen:
         for array, value in zip(values, (entry.young, entry.poisson, entry.density), strict=True):
             if value is not None:
-                array[chosen] = value
+                array[inside] = value
     return Isotropic(*values)

@@ -1,26 +1,21 @@
-"""The commands and their options, which import neither Warp nor NumPy: help is quick.
+"""The commands and their options, as one table, which imports neither Warp nor NumPy: help is quick.
 
-Options are declared as dataclasses: argparse, run files and the help follow from fields and docstrings. The annotation
-of a field says how its option is read: ``bool`` for a flag, ``list[...]`` for an option that can be given several
-times, ``tuple[...]`` for several values, ``Annotated[type, function]`` for a text that a function reads. The field's
-metadata are further arguments of ``add_argument``. Its entry below "Attributes:" in the docstring of its class,
-``name (METAVARS): help``, is its help; names in braces there are values of this module and of `choices`.
+argparse, run files and the help follow from `TABLE`.
 """
 
 from __future__ import annotations
 
 import argparse
-import inspect
 import re
-from collections.abc import Callable
-from dataclasses import MISSING, dataclass, field, fields
+from collections.abc import Callable, Sequence
+from functools import cache, partial
 from pathlib import Path
-from types import NoneType
-from typing import Annotated, Any, NamedTuple, get_args, get_origin, get_type_hints
+from typing import Any, NamedTuple
 
-from warp_corot.errors import InputError
 from warp_corot.inputs import choices
-from warp_corot.inputs.choices import ELEMENT, INTEGRATORS, MODELS, SHARED
+from warp_corot.inputs.choices import INTEGRATORS, MODELS
+
+from .quantities import AUTO, ground_height, number, quantity, rotation_level, unit_of_length, value_range, whole_number
 
 # --- values of options that are not given ----------------------------------------------------------------------------
 
@@ -32,12 +27,8 @@ BOX_LEVEL = 6
 STIFFNESS_PER_WEIGHT = 20.0
 #: With a level: the number of root cubes along the body's longest side.
 CUBES_OF_LEVEL = 16
-#: Maximum number of bisections of cubes with a surface error.
-MAX_LEVEL_FOR_ERROR = 12
 #: The step of implicit integrators if none is given [s].
 IMPLICIT_DT = 0.01
-#: The height of the ground that lies just below the bodies.
-AUTO = "auto"
 #: The form of a label or region and its material.
 LABEL = "NAME[@NUMBER[+NUMBER...]]=YOUNG[:POISSON[:DENSITY]]"
 #: Loads: number of values after PATCH.
@@ -54,194 +45,6 @@ VIEWS = {
 }
 SIDES = ", ".join(VIEWS)
 
-
-# --- quantities: a number in SI units, or with a unit, for example 5kPa ----------------------------------------------
-
-
-def quantity(unit: str) -> Callable[[str], float]:
-    """A function that converts an option's text to a number in a unit, for ``add_argument(type=...)``."""
-
-    def parse(text: str) -> float:
-        from warp_corot.domain.units import in_units
-
-        try:
-            return in_units(text, unit)
-        except InputError as error:
-            raise argparse.ArgumentTypeError(str(error)) from None
-
-    return parse
-
-
-def number(text: str) -> float:
-    """A number."""
-    try:
-        return float(text)
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"{text!r} must be a number, for example 0.45") from None
-
-
-def whole_number(text: str) -> int:
-    """A whole number: 20000 or 2e4."""
-    try:
-        value = float(text)
-        if value == int(value):
-            return int(text) if text.strip().lstrip("+-").isdecimal() else int(value)
-    except (ValueError, OverflowError):
-        pass
-    raise argparse.ArgumentTypeError(f"{text!r} must be a whole number, for example 20000 or 2e4")
-
-
-def rotation_level(text: str) -> int | float | str:
-    """A level of the tree, a tolerance [rad], or "auto"."""
-    if text == "auto":
-        return text
-    try:
-        return int(text)
-    except ValueError:
-        return number(text)
-
-
-metres = quantity("m")
-
-
-@dataclass(frozen=True)
-class Interval:
-    """A range of numbers with both ends."""
-
-    low: float
-    high: float
-
-    def __str__(self) -> str:
-        return f"{self.low!r}:{self.high!r}"
-
-
-def value_range(text: str) -> Interval:
-    """Two numbers LOW:HIGH, or one without an upper limit."""
-    words = text.split(":")
-    try:
-        low, high = [float(word) for word in words] if len(words) == 2 else (float(text), float("inf"))
-    except ValueError:
-        low, high = float("nan"), float("nan")
-    if not low <= high:
-        raise argparse.ArgumentTypeError(f"{text!r} must be a number or LOW:HIGH, for example 200 or -200:300")
-    return Interval(low, high)
-
-
-def unit_of_length(text: str) -> str:
-    """A unit, or a length used as a unit: mm or 3.2cm."""
-    from warp_corot.domain.units import metres_per_unit
-
-    try:
-        metres_per_unit(text)
-    except InputError as error:
-        raise argparse.ArgumentTypeError(str(error).removeprefix("unit is ")) from None
-    return text
-
-
-def ground_height(text: str) -> float | str:
-    """A height [m] or "auto", for ``add_argument(type=...)``."""
-    if text == AUTO:
-        return text
-    try:
-        return metres(text)
-    except argparse.ArgumentTypeError as error:
-        raise argparse.ArgumentTypeError(f"{error}; it must be a height or {AUTO} (INPUT stands before it)") from None
-
-
-def tool_shape(text: str) -> Any:
-    """A `ToolShape` from the text of ``--tool``."""
-    from .tool_paths import tool_shape as read
-
-    return read(text)
-
-
-#: Types of options, with the functions that read them.
-Number = Annotated[float, number]
-WholeNumber = Annotated[int, whole_number]
-Pressure = Annotated[float, quantity("Pa")]
-Density = Annotated[float, quantity("kg/m^3")]
-Seconds = Annotated[float, quantity("s")]
-Metres = Annotated[float, metres]
-PerSecond = Annotated[float, quantity("1/s")]
-Acceleration = Annotated[float, quantity("m/s^2")]
-UnitOfLength = Annotated[str, unit_of_length]
-RotationLevel = Annotated[int | float | str, rotation_level]
-ValueRange = Annotated[Interval, value_range]
-GroundHeight = Annotated[float | str, ground_height]
-Tool = Annotated[Any, tool_shape]
-
-
-# --- declared options ------------------------------------------------------------------------------------------------
-
-
-class StrictParser(argparse.ArgumentParser):
-    """Accepts neither abbreviations nor ``--`` as a value, which argparse turns into an empty list."""
-
-    def __init__(self, **options: Any):
-        options.setdefault("allow_abbrev", False)
-        super().__init__(**options)
-
-    def _get_values(self, action: argparse.Action, arg_strings: list[str]) -> Any:
-        if action.option_strings and "--" in arg_strings:
-            self.error(f"argument {'/'.join(action.option_strings)}: '--' is not a value")
-        return super()._get_values(action, arg_strings)
-
-
-_ENTRY = re.compile(r"^    (\w+)(?: \(([^)]*)\))?: (.*(?:\n {8}.*)*)", re.MULTILINE)
-
-
-def one_of(*words: str, default: str | None = None, type: Callable[[str], str] = str) -> Any:
-    """A field with one of several words."""
-    return field(default=default, metadata={"choices": words, "type": type})
-
-
-def add_declared(parser: argparse.ArgumentParser, kind: type) -> None:
-    """Add the options of a dataclass, and before them those of its base classes, the last one first, as fields are.
-
-    The options of a class with a ``TITLE`` are a group of the help.
-    """
-    for part in reversed(kind.__mro__[:-1]):
-        own, title = inspect.get_annotations(part), vars(part).get("TITLE")
-        if own:
-            _add_fields(parser.add_argument_group(title) if title else parser, part, own)
-
-
-def _add_fields(group: Any, kind: Any, own: dict[str, Any]) -> None:
-    hints = get_type_hints(kind, include_extras=True)
-    said = {name: (metavars, text) for name, metavars, text in _ENTRY.findall(inspect.getdoc(kind) or "")}
-    exclusive: Any = None
-    for each in (each for each in fields(kind) if each.name in own):
-        metavars, text = said.get(each.name, ("", ""))
-        options = {"flags": (f"--{each.name.replace('_', '-')}",), **_read_by(hints[each.name]), **each.metadata}
-        options["help"] = " ".join(text.split()).replace("%", "%%").format(**_VALUES)
-        if metavars:
-            options["metavar"] = tuple(metavars.split()) if isinstance(options.get("nargs"), int) else metavars
-        if each.default is not MISSING:
-            options["default"] = each.default
-        elif options["flags"][0].startswith("-"):
-            options["required"] = True
-        to = group
-        if options.pop("exclusive", False):
-            to = exclusive = exclusive or group.add_mutually_exclusive_group()
-        to.add_argument(*options.pop("flags"), **options)
-
-
-def _read_by(hint: Any) -> dict[str, Any]:
-    """The arguments of ``add_argument`` for an annotation."""
-    kind = get_origin(hint)
-    if kind is Annotated:
-        return {"type": hint.__metadata__[0]}
-    if kind is list:
-        return {"action": "append", **_read_by(get_args(hint)[0])}
-    if kind is tuple:
-        return {"nargs": len(get_args(hint)), **_read_by(get_args(hint)[0])}
-    if kind is not None:  # a union with None
-        return _read_by(next(each for each in get_args(hint) if each is not NoneType))
-    if hint is bool:
-        return {"action": "store_true"}
-    return {} if hint is str else {"type": hint}
-
-
 EXIT_CODES = """exit status:
   0    done
   1    a file could not be written, for example because the disk is full
@@ -249,487 +52,314 @@ EXIT_CODES = """exit status:
   3    the simulation became unstable; the frames before that are kept
   130  interrupted (Ctrl-C), 143 terminated (SIGTERM); the written frames are kept"""
 
-# --- a run: of simulate, view and run files --------------------------------------------------------------------------
-
 #: Models and integrators that the command line has options for.
 CHOICES = [name for name in MODELS if name not in ("holzapfel-gasser-ogden", "prestressed", "prony")]
 STEPPING = [name for name in INTEGRATORS if name != "quasi-static"]
 
+# --- the table -------------------------------------------------------------------------------------------------------
 
-@dataclass(kw_only=True)
-class InputOptions:
-    """What is simulated.
+#: Groups of options, each below a line with its name and, if the help shows it, its title. An option is
+#: ``NAME METAVARS [KIND=DEFAULT]: help``, with ``!`` after the name if it must be given, and ``...`` before the colon
+#: if it can be given several times. A kind is one of `KINDS`, a unit, words with ``|`` between them, or a flag. Names
+#: in braces are values of this module and of `choices`.
+TABLE = """
+== input
+INPUT [text]: what to simulate. A mesh with volume, whose other cells are split into tetrahedra: a USD file with a
+    TetMesh, or a Mesh with tetraIndices; .vtk, .vtu, .vtm, .msh of Gmsh, .inp of Abaqus, .mesh, .node, .ele, .vol and
+    others; warp:bear, a toy bear; or box, the beam of Tagawa et al. 2013. A closed surface: .obj, .stl, .ply, .off,
+    .glb, .vtp, a USD file with only Mesh prims, one of the other files with only triangles; or warp:bunny. A
+    segmented scan: .nii, .nii.gz, .mha, .mhd, .nrrd, .vti, or a folder with a DICOM series. Or a run file, .toml
 
-    Attributes:
-        input (INPUT): what to simulate. A mesh with volume, whose other cells are split into tetrahedra: a USD file
-            with a TetMesh, or a Mesh with tetraIndices; .vtk, .vtu, .vtm, .msh of Gmsh, .inp of Abaqus, .mesh, .node,
-            .ele, .vol and others; warp:bear, a toy bear; or box, the beam of Tagawa et al. 2013. A closed surface:
-            .obj, .stl, .ply, .off, .glb, .vtp, a USD file with only Mesh prims, one of the other files with only
-            triangles; or warp:bunny. A segmented scan: .nii, .nii.gz, .mgz, .mha, .mhd, .nrrd, .vti, or a folder with a
-            DICOM series. Or a run file, .toml
-    """
+== output
+-o output OUT.usd [path]: animation to write (.usd, .usdc or .usda)
+also OUT.pvd [path]...: also write for ParaView, with displacement, velocity, strain and stress: .pvd with all frames,
+    or .vtu with the last; can be given several times
+static [flag]: find where the body is at rest in place of its motion: one frame, or with --pull, --twist or --press a
+    state of rest for each frame
 
-    input: str = field(metadata={"flags": ("input",)})
+== body: the body
+unit LENGTH [unit]: unit of the file's coordinates: mm, inch, 3.2cm, ... (default: the file's own; if it has none, m
+    for up to 3 units, else mm, or cm for bodies of up to 10)
+join [flag]: make everything in the file one body, and merge coincident nodes of tetrahedra (default: closed surfaces,
+    and prims, blocks and instances of tetrahedra, are separate bodies)
+level L [whole]: number of bisections of the cubes of the box; three halve the edge (default: {BOX_LEVEL}). For
+    surfaces and scans, in place of --tets: of the cubes at the surface, {CUBES_OF_LEVEL} along the longest side
+scale S [number]: multiply the coordinates by this, after --unit
+offset DX DY DZ [m]: move the body by this much before the run starts [m], after --scale; this places the bodies of a
+    run file
+up AXIS [Y|Z]: axis that points up, y or z (default: the file's, or the convention of its format)
+young E [Pa]: Young's modulus [Pa] (default: {STIFFNESS_PER_WEIGHT:g} times density, gravity and height, so that a
+    body sags visibly and stands)
+poisson NU [number]: Poisson's ratio (default: 0.45)
+toughness G [number]: energy that a cut takes [J/m^2] (default: 0)
+density RHO [kg/m^3]: mass density [kg/m^3] (default: 1000)
+materials LIST [text]: materials of the file's regions (physical groups, sets or cell data) or of a scan's labels, for
+    example liver=3kPa:0.45,vessel@4=30kPa; everything else has --young, --poisson and --density
+regions-by ARRAY [text]: array of the file that numbers its regions (default: the likeliest one)
+model [{CHOICES}=corotated]: elastic model (default: corotated)
+rotation-level L [rotations]: share rotations among elements, on the mesh of box, a surface or a scan: at the tree's
+    level L; or, with auto or a tolerance in radians, where they are similar (default: each element has its own)
+dilatation [element|shared]: whether elements share their change of volume: shared does not lock where Poisson's ratio
+    is near 1/2, and is slower (default: shared where it is 0.45 or more, else element)
+region PATCH VALUES [text]...: another material for the tetrahedra whose centre is in a patch:
+    YOUNG[:POISSON[:DENSITY]], for example 30kPa:0.45; can be given several times; where patches overlap the last one
+    is used
+patch NAME=EXPR [text]...: name a patch, for other options and for later patches
+fix PATCH [text]...: fix these nodes, for example bottom or "z < 0.01"; none fixes nothing; can be given several times
+    (default: what the body stands on, if that is flat and supports it; else nothing, and it lies on a ground)
 
+== organ: a body from a surface or a scan
+tets N [whole]: largest number of tetrahedra; the mesh has nearly as many (default: {TETS})
+min-layers K [number]: tetrahedra through the thickness of thin parts, where --tets allows (default: 2)
+labels LIST [text]: for a scan: the labels that make up the body, and their materials, for example
+    liver=3kPa:0.45,vessel@4=30kPa:0.45 (default: all labels, one material)
+smoothing M [m]: smooth away the steps of voxels, over this length [m]
+threshold LOW[:HIGH] [range]: for a scan without labels: voxels with these values make up the body, for example 200 or
+    -200:300
+skin [input|marched]: surface to draw: the input's own, with its texture coordinates, names and materials, or the
+    marched surface of the tetrahedra (default: input)
+draw-tets [flag]: write the tetrahedra as well as the surface
+draw-labels [flag]: write a closed surface for each label
 
-@dataclass(kw_only=True)
-class OutputOptions:
-    """What is written.
+== motion: the motion
+gravity X Y Z [m/s^2]: gravity [m/s^2] (default: 9.81 down the up axis, z if a file has none)
+pull PATCH DX DY DZ [text]...: move a patch by this much [m], for example 0 0 3cm
+twist PATCH DEGREES [text]...: turn a patch about its mean normal, counter-clockwise seen from outside
+press PATCH PASCALS [text]...: press on the surface of a patch, along its normals at rest; a negative pressure pulls
+ramp T [s]: time in which pulls, twists and pressures grow to their full values [s] (default: half of the duration)
+damping C [1/s]: mass-proportional damping [1/s] (default: 2)
+viscosity S [s]: stiffness-proportional damping: viscous over elastic stress at one strain [s]; a vibration of angular
+    frequency w decays by S w^2 / 2 (default: 0)
+duration T [s]: simulated time [s] (default: 4)
+fps F [number={FPS:g}]: frames per second (default: {FPS:g})
+dt [s]: time step [s], shortened so that a whole number of them makes a frame (default: the step follows the state;
+    {IMPLICIT_DT:g} s with an implicit --integrator)
+integrator [{STEPPING}]: explicit, symplectic-euler, whose steps are bound by the smallest element, or an implicit one
+    for steps of any length (default: symplectic-euler, or backward-euler where explicit steps would be slower than
+    real time and less than half as fast)
 
-    Attributes:
-        output (OUT.usd): animation to write (.usd, .usdc or .usda)
-        also (OUT.pvd): also write for ParaView, with displacement, velocity, strain and stress: .pvd or .xdmf with all
-            frames, or .vtu with the last; can be given several times
-        static: find where the body is at rest in place of its motion: one frame, or with --pull, --twist or --press a
-            state of rest for each frame
-    """
+== contact: contact
+ground HEIGHT [height]: put a ground at this height against gravity [m], or just below the bodies (auto, the default
+    height); bodies stand on it, and nothing is fixed without --fix
+no-ground [flag]: hold a body that would lie on a ground, because it has no flat feet to stand on, at a flat region or
+    a broad side
+drop HEIGHT [m]: let the bodies fall freely onto a ground this far below them [m]
+tool SHAPE [text]...: press with a rigid tool: sphere:r=5mm, capsule:r=4mm,l=100mm, cylinder:r=4mm,l=100mm or
+    box:x=2cm,y=2cm,z=5mm, with its axis along z; a friction=MU of its own may follow; can be given several times
+tool-path PATH.csv [path]...: how the tool moves: rows of time [s], x, y, z of its centre [m] and, if it turns,
+    quaternions qx, qy, qz, qw; one row for a tool that stays; one path for each --tool, in the same order
+blade PATH.csv [path]...: cut with a straight edge, along z about its centre, which moves as --tool-path says; can be
+    given several times
+blade-length L [m]: length of blades [m] (default: three times the body's size)
+touch [flag]: let the bodies touch one another; always on with a ground or a tool
+self-contact [flag]: let the bodies touch themselves, too
+friction MU [number]: coefficient of friction of all contacts (default: 0.3)
 
-    output: Path | None = field(default=None, metadata={"flags": ("-o", "--output")})
-    also: list[Path] | None = None
-    static: bool = False
+== remesh: a mesh that follows the motion, of box, surfaces and scans
+remesh [flag]: refine tetrahedra where they are stretched, and merge them again elsewhere
+refine-above X [number]: bisect elements whose longest edge is more than X times as long as at rest (default:
+    {REFINE_ABOVE:g})
+simplify-below X [number]: merge elements whose longest edge is less than X times as long as at rest (default:
+    {SIMPLIFY_BELOW:g})
+remesh-levels MIN MAX [whole]: minimum and maximum number of bisections of a cube (default: nowhere fewer than at the
+    start, and up to three more than its most)
+remesh-every N [whole]: steps from one pass of remeshing to the next (default: {REMESH_EVERY})
+capacity N [whole]: largest number of tetrahedra (default: four times the number at the start, or 100000)
 
+== results: more results
+preview FILE [path]: also draw the last frame (.png), or a film of all frames (.gif, .mp4)
+preview-frames LIST [text]: draw these frames side by side into the .png, counted from 0, or back from -1, for example
+    0,12,-1
+preview-views LIST [text]: draw from these sides: {SIDES}, or AZIMUTH:ELEVATION [°], for example front,left,35:14
+    (default: corner)
+probe POINT|PATCH [text]...: record this point, "X Y Z" [m], or patch in --csv; can be given several times
+csv FILE.csv [path]: write displacement, velocity and reaction of each probe, the forces on ground and tools, and the
+    energies, of every frame
+write-run RUN.toml [path]: save these options as a run file
 
-@dataclass(kw_only=True)
-class BodyOptions:
-    """The body.
+== device
+device [text]: where to compute: "cpu", "cuda:0", ... (default: a GPU if there is one)
+threads N [int]: the most threads on the CPU (default: as many as there are cores)
 
-    Attributes:
-        unit (LENGTH): unit of the file's coordinates: mm, inch, 3.2cm, ... (default: the file's own; if it has none, m
-            for up to 3 units, else mm, or cm for bodies of up to 10)
-        join: make everything in the file one body, and merge coincident nodes of tetrahedra (default: closed surfaces,
-            and prims, blocks and instances of tetrahedra, are separate bodies)
-        level (L): number of bisections of the cubes of the box; three halve the edge (default: {BOX_LEVEL}). For
-            surfaces and scans, in place of --tets: of the cubes at the surface, {CUBES_OF_LEVEL} along the longest side
-            if --cell-size is not given
-        scale (S): multiply the coordinates by this, after --unit
-        offset (DX DY DZ): move the body by this much before the run starts [m], after --scale; this places the bodies
-            of a run file
-        up (AXIS): axis that points up, y or z (default: the file's, or the convention of its format)
-        young (E): Young's modulus [Pa] (default: {STIFFNESS_PER_WEIGHT:g} times density, gravity and height, so that a
-            body sags visibly and stands)
-        poisson (NU): Poisson's ratio (default: 0.45)
-        toughness (G): energy that a cut takes [J/m^2] (default: 0)
-        density (RHO): mass density [kg/m^3] (default: 1000)
-        materials (LIST): materials of the file's regions (physical groups, sets or cell data) or of a scan's labels,
-            for example liver=3kPa:0.45,vessel@4=30kPa; everything else has --young, --poisson and --density
-        regions_by (ARRAY): array of the file that numbers its regions (default: the likeliest one)
-        model: elastic model (default: corotated)
-        rotation_level (L): share rotations among elements, on the mesh of box, a surface or a scan: at the tree's level
-            L; or, with auto or a tolerance in radians, where they are similar (default: each element has its own)
-        dilatation: whether elements share their change of volume: shared does not lock where Poisson's ratio is near
-            1/2, and is slower (default: shared where it is 0.45 or more, else element)
-        region (PATCH VALUES): another material for the tetrahedra whose centre is in a patch:
-            YOUNG[:POISSON[:DENSITY]], for example 30kPa:0.45; can be given several times; where patches overlap the
-            last one is used
-        patch (NAME=EXPR): name a patch, for other options and for later patches
-        fix (PATCH): fix these nodes, for example bottom or "z < 0.01"; none fixes nothing; can be given several times
-            (default: what the body stands on, if that is flat and supports it; else nothing, and it lies on a ground)
-    """
+== page: the page
+host ADDRESS [text=127.0.0.1]: address to listen at (default: 127.0.0.1)
+port N [whole=8080]: port; 0: any free one (8080)
+token WORD [text]: word that visitors need, as in http://ADDRESS:N/?token=WORD (default: none on this computer; a
+    random word where others can reach the address)
 
-    TITLE = "the body"
+== sweep
+INPUT [text]: as for simulate: a run file, a mesh, a surface, a scan or box
+vary! OPTION=VALUES [text]...: an option of simulate and its values: A,B,C, FIRST:LAST:COUNT or FIRST:LAST:COUNT:log;
+    may be repeated
+probe WHERE [text]...: as for simulate: its motion is a result
+duration T [text]: as for simulate
+-o output FOLDER [path]: folder for the results
+workers N [int]: processes (default: one a card, or one a core)
+retries N [int=2]: how often a failed run is repeated (default: 2)
+device [text]: as for simulate
 
-    unit: UnitOfLength | None = None
-    join: bool = False
-    level: WholeNumber | None = None
-    scale: Number | None = None
-    offset: tuple[Metres, Metres, Metres] | None = None
-    up: str | None = one_of("Y", "Z", type=str.upper)
-    young: Pressure | None = None
-    poisson: Number | None = None
-    toughness: Number | None = None
-    density: Density | None = None
-    materials: str | None = None
-    regions_by: str | None = None
-    model: str = one_of(*CHOICES, default="corotated")
-    rotation_level: RotationLevel | None = None
-    dilatation: str | None = one_of(ELEMENT, SHARED)
-    region: list[tuple[str, str]] | None = None
-    patch: list[str] | None = None
-    fix: list[str] | None = None
+== stage files
+INPUT [path]: stage with TetMesh prims (.usd, .usda, .usdc, .usdz)
+-o output! OUT.usd [path]: stage to write (.usd, .usdc or .usda)
 
+== stage bodies: what the stage does not define
+young E [Pa]: Young's modulus [Pa] (default: 20 times the weight of a column as high as the body, over its area)
+poisson NU [number]: Poisson's ratio (default: 0.45)
+density RHO [kg/m^3]: [kg/m^3] (default: 1000)
+ground HEIGHT [text=auto]: height of a ground plane [m]; auto: below the bodies if nothing is held and no collider
+    stays in place (default); or none
+radius R [m=0]: contact radius around each point of soft bodies [m]: half of an edge closes the gaps between points,
+    through which smaller things slip, and keeps bodies that far from others (default: 0)
+no-soft-contact [flag]: soft bodies and cloth pass through one another, which takes less time
+fix EXPR [text]: points that are held, for example "z > zmax - 0.01": see simulate --help [m]
 
-@dataclass(kw_only=True)
-class OrganOptions:
-    """A body from a surface or a scan.
+== stage motion: the motion
+gravity X Y Z [m/s^2]: [m/s^2] (default: the stage's, else 9.81 down)
+viscosity S [s]: viscous over elastic shear stress of one strain [s] (default: 5 % of critical damping for each body's
+    slowest vibration)
+damping C [1/s=0]: mass-proportional damping [1/s], which also damps falls (default: 0)
+duration T [s=2]: simulated time [s] (default: 2)
+fps F [number]: frames per second (default: the stage's time codes per second, else 24)
+integrator [explicit|implicit=explicit]: explicit: many short steps; implicit: steps of any length, for stiff bodies,
+    by backward Euler, which damps; soft bodies then pass through one another, and there is no cloth (default:
+    explicit)
+dt [s]: longest time step [s] (default: a safe one; 1/60 s if implicit)
+rigid [semi-implicit|xpbd|none=semi-implicit]: which of Newton's solvers steps rigid bodies and joints (default:
+    semi-implicit)
 
-    Attributes:
-        tets (N): largest number of tetrahedra; the mesh has nearly as many (default: {TETS}, unless --max-level or
-            --surface-error is given)
-        min_layers (K): tetrahedra through the thickness of thin parts, where --tets allows (default: 2)
-        cell_size (M): edge of the coarsest cubes [m] (default: chosen to suit --tets)
-        max_level (L): maximum number of bisections of a cube; three halve the edge (default: chosen to suit --tets;
-            {MAX_LEVEL_FOR_ERROR} with --surface-error)
-        surface_error (M): largest distance of the mesh's surface from the input's [m] (default: as small as the other
-            options allow)
-        labels (LIST): for a scan: the labels that make up the body, and their materials, for example
-            liver=3kPa:0.45,vessel@4=30kPa:0.45 (default: all labels, one material)
-        smoothing (M): smooth away the steps of voxels, over this length [m]
-        threshold (LOW[:HIGH]): for a scan without labels: voxels with these values make up the body, for example 200 or
-            -200:300
-        skin: surface to draw: the input's own, with its texture coordinates, names and materials, or the marched
-            surface of the tetrahedra (default: input)
-        draw_tets: write the tetrahedra as well as the surface
-        draw_labels: write a closed surface for each label
-    """
+== stage look: the output
+show-stress [flag]: colour soft bodies by stress, in place of their materials
+flatten [flag]: write one file that needs no other stage
 
-    TITLE = "a body from a surface or a scan"
+== stage device
+device [text]: "cpu", "cuda:0", ... (default: a GPU if there is one)
 
-    tets: WholeNumber | None = None
-    min_layers: Number | None = None
-    cell_size: Metres | None = None
-    max_level: WholeNumber | None = None
-    surface_error: Metres | None = None
-    labels: str | None = None
-    smoothing: Metres | None = None
-    threshold: ValueRange | None = None
-    skin: str | None = one_of("input", "marched")
-    draw_tets: bool = False
-    draw_labels: bool = False
+== warm-up
+device [text]: "cpu", "cuda:0", ... (default: Warp's choice)
+all [flag]: also all elastic models, remeshing, states of rest and own surfaces
 
+== verify
+CASES* CASE [text]: names of cases (default: all)
+list [flag]: list the cases, and run none
+full [flag]: finer meshes and longer times: minutes on a CPU core, where the quick form takes half a minute
+json FILE [path]: also write the rows as JSON
+device [text]: "cpu", "cuda:0", ... (default: Warp's choice)
+"""
 
-@dataclass(kw_only=True)
-class MotionOptions:
-    """The motion.
+#: Groups of the options of a body, and of a run.
+OF_BODIES = ("body", "organ", "motion", "contact", "remesh")
+RUN = ("input", "output", *OF_BODIES, "results", "device")
 
-    Attributes:
-        gravity (X Y Z): gravity [m/s^2] (default: 9.81 down the up axis, z if a file has none)
-        pull (PATCH DX DY DZ): move a patch by this much [m], for example 0 0 3cm
-        twist (PATCH DEGREES): turn a patch about its mean normal, counter-clockwise seen from outside
-        press (PATCH PASCALS): press on the surface of a patch, along its normals at rest; a negative pressure pulls
-        ramp (T): time in which pulls, twists and pressures grow to their full values [s] (default: half of the
-            duration)
-        damping (C): mass-proportional damping [1/s] (default: 2)
-        viscosity (S): stiffness-proportional damping: viscous over elastic stress at one strain [s]; a vibration of
-            angular frequency w decays by S w^2 / 2 (default: 0)
-        duration (T): simulated time [s] (default: 4)
-        fps (F): frames per second (default: {FPS:g})
-        dt: time step [s], shortened so that a whole number of them makes a frame (default: the step follows the state;
-            {IMPLICIT_DT:g} s with an implicit --integrator)
-        integrator: explicit, symplectic-euler, whose steps are bound by the smallest element, or an implicit one for
-            steps of any length (default: symplectic-euler, or backward-euler where explicit steps would be slower than
-            real time and less than half as fast)
-    """
-
-    TITLE = "the motion"
-
-    gravity: tuple[Acceleration, Acceleration, Acceleration] | None = None
-    pull: list[tuple[str, str, str, str]] | None = None
-    twist: list[tuple[str, str]] | None = None
-    press: list[tuple[str, str]] | None = None
-    ramp: Seconds | None = None
-    damping: PerSecond | None = None
-    viscosity: Seconds | None = None
-    duration: Seconds | None = None
-    fps: Number = FPS
-    dt: Seconds | None = None
-    integrator: str | None = one_of(*STEPPING)
-
-
-@dataclass(kw_only=True)
-class ContactOptions:
-    """What bodies touch.
-
-    Attributes:
-        ground (HEIGHT): put a ground at this height against gravity [m], or just below the bodies (auto, the default
-            height); bodies stand on it, and nothing is fixed without --fix
-        no_ground: hold a body that would lie on a ground, because it has no flat feet to stand on, at a flat region or
-            a broad side
-        drop (HEIGHT): let the bodies fall freely onto a ground this far below them [m]
-        tool (SHAPE): press with a rigid tool: sphere:r=5mm, capsule:r=4mm,l=100mm, cylinder:r=4mm,l=100mm or
-            box:x=2cm,y=2cm,z=5mm, with its axis along z; a friction=MU of its own may follow; can be given several
-            times
-        tool_path (PATH.csv): how the tool moves: rows of time [s], x, y, z of its centre [m] and, if it turns,
-            quaternions qx, qy, qz, qw; one row for a tool that stays; one path for each --tool, in the same order
-        blade (PATH.csv): cut with a straight edge, along z about its centre, which moves as --tool-path says; can be
-            given several times
-        blade_length (L): length of blades [m] (default: three times the body's size)
-        touch: let the bodies touch one another; always on with a ground or a tool
-        self_contact: let the bodies touch themselves, too
-        friction (MU): coefficient of friction of all contacts (default: 0.3)
-    """
-
-    TITLE = "contact"
-
-    ground: GroundHeight | None = field(default=None, metadata={"nargs": "?", "const": AUTO})
-    no_ground: bool = False
-    drop: Metres | None = None
-    tool: list[Tool] | None = None
-    tool_path: list[Path] | None = None
-    blade: list[Path] | None = None
-    blade_length: Metres | None = None
-    touch: bool = False
-    self_contact: bool = False
-    friction: Number | None = None
-
-
-@dataclass(kw_only=True)
-class RemeshOptions:
-    """A mesh that follows the motion.
-
-    Attributes:
-        remesh: refine tetrahedra where they are stretched, and merge them again elsewhere
-        refine_above (X): bisect elements whose longest edge is more than X times as long as at rest (default:
-            {REFINE_ABOVE:g})
-        simplify_below (X): merge elements whose longest edge is less than X times as long as at rest (default:
-            {SIMPLIFY_BELOW:g})
-        remesh_levels (MIN MAX): minimum and maximum number of bisections of a cube (default: nowhere fewer than at the
-            start, and up to three more than its most)
-        remesh_every (N): steps from one pass of remeshing to the next (default: {REMESH_EVERY})
-        capacity (N): largest number of tetrahedra (default: four times the number at the start, or 100000)
-    """
-
-    TITLE = "a mesh that follows the motion, of box, surfaces and scans"
-
-    remesh: bool = False
-    refine_above: Number | None = None
-    simplify_below: Number | None = None
-    remesh_levels: tuple[WholeNumber, WholeNumber] | None = None
-    remesh_every: WholeNumber | None = None
-    capacity: WholeNumber | None = None
+#: Functions that read the text of an option, by kind.
+KINDS: dict[str, Callable[[str], Any]] = {
+    "text": str,
+    "path": Path,
+    "int": int,
+    "number": number,
+    "whole": whole_number,
+    "unit": unit_of_length,
+    "rotations": rotation_level,
+    "range": value_range,
+    "height": ground_height,
+}
 
 
-@dataclass(kw_only=True)
-class ResultOptions:
-    """More results.
+class Option(NamedTuple):
+    """An option.
 
     Attributes:
-        preview (FILE): also draw the last frame (.png), or a film of all frames (.gif, .mp4)
-        preview_frames (LIST): draw these frames side by side into the .png, counted from 0, or back from -1, for
-            example 0,12,-1
-        preview_views (LIST): draw from these sides: {SIDES}, or AZIMUTH:ELEVATION [°], for example front,left,35:14
-            (default: corner)
-        probe (POINT|PATCH): record this point, "X Y Z" [m], or patch in --csv; can be given several times
-        csv (FILE.csv): write displacement, velocity and reaction of each probe, the forces on ground and tools, and the
-            energies, of every frame
-        write_run (RUN.toml): save these options as a run file
+        name: Its name in Python.
+        flags: The words that name it; for what stands alone, the name itself.
+        settings: More arguments of ``add_argument``.
     """
 
-    TITLE = "more results"
+    name: str
+    flags: tuple[str, ...]
+    settings: dict[str, Any]
 
-    preview: Path | None = None
-    preview_frames: str | None = None
-    preview_views: str | None = None
-    probe: list[str] | None = None
-    csv: Path | None = None
-    write_run: Path | None = None
+    @property
+    def default(self) -> Any:
+        """Its value if it is not given."""
+        return self.settings.get("default")
 
+    @property
+    def is_flag(self) -> bool:
+        """Whether it has no value."""
+        return self.settings.get("action") == "store_true"
 
-@dataclass(kw_only=True)
-class DeviceOptions:
-    """Where it runs.
-
-    Attributes:
-        device: where to compute: "cpu", "cuda:0", ... (default: a GPU if there is one)
-        threads (N): the most threads on the CPU (default: as many as there are cores)
-    """
-
-    device: str | None = None
-    threads: int | None = None
+    @property
+    def is_list(self) -> bool:
+        """Whether it can be given several times."""
+        return self.settings.get("action") == "append"
 
 
-@dataclass(kw_only=True)
-class RunOptions(
-    DeviceOptions,
-    ResultOptions,
-    RemeshOptions,
-    ContactOptions,
-    MotionOptions,
-    OrganOptions,
-    BodyOptions,
-    OutputOptions,
-    InputOptions,
-):
-    """All options of a run."""
+_ENTRY = re.compile(r"((?:-\w )?)(\S+?)([!*]?)((?: (?!\[)\S+)*) \[([^\]=]*)=?([^\]]*)\](\.*): (.*)")
+
+
+@cache
+def table() -> dict[str, tuple[str, tuple[Option, ...]]]:
+    """The title and the options of each group."""
+    found = {}
+    known = vars(choices) | {name: value for name, value in globals().items() if name.isupper() and name != "TABLE"}
+    words = {name: "|".join(value) for name, value in known.items() if name in ("CHOICES", "STEPPING")}
+    for group in TABLE.format(**(known | words)).split("\n== ")[1:]:
+        head, _, text = group.replace("\n    ", " ").partition("\n")
+        name, _, title = head.partition(": ")
+        found[name] = title, tuple(map(_option, text.strip().splitlines()))
+    return found
+
+
+def _option(line: str) -> Option:
+    match = _ENTRY.fullmatch(line)
+    assert match is not None, line
+    short, name, mark, metavars, kind, default, many, text = match.groups()
+    settings: dict[str, Any] = {"help": text.replace("%", "%%")}
+    dest, shown = name.lower().replace("-", "_"), tuple(metavars.split())
+    if kind == "flag":
+        return Option(dest, (f"--{name}",), settings | {"action": "store_true", "default": False})
+    if "|" in kind:
+        settings |= {"choices": kind.split("|"), "type": partial(_as_listed, tuple(kind.split("|")))}
+    else:
+        settings["type"] = KINDS[kind] if kind in KINDS else quantity(kind)
+    if name.isupper():
+        settings |= {"metavar": shown[0] if shown else name} | ({"nargs": "*"} if mark else {})
+        return Option(dest, (dest,), settings)
+    if shown:
+        settings |= {"metavar": shown, "nargs": len(shown)} if len(shown) > 1 else {"metavar": shown[0]}
+    settings |= {"nargs": "?", "const": AUTO} if kind == "height" else {}
+    settings |= {"action": "append"} if many else {}
+    settings |= (
+        {"required": True}
+        if mark
+        else {"default": KINDS.get(kind, str if "|" in kind else float)(default) if default else None}
+    )
+    return Option(dest, (*short.split(), f"--{name}"), settings)
+
+
+def _as_listed(words: Sequence[str], text: str) -> str:
+    """The word of a list that a text is in another case, or the text."""
+    return next((word for word in words if word.lower() == text.lower()), text)
+
+
+def options_of(groups: Sequence[str]) -> list[Option]:
+    """The options of groups."""
+    return [option for name in groups for option in table()[name][1]]
+
+
+def add_options(parser: argparse.ArgumentParser, groups: Sequence[str]) -> None:
+    """Add groups of options to a parser; those with a title are groups of the help."""
+    for title, options in (table()[name] for name in groups):
+        group = parser.add_argument_group(title) if title else parser
+        for option in options:
+            group.add_argument(*option.flags, **option.settings)
 
 
 #: Options that all bodies of a run share, as those of one body cannot differ.
 OF_THE_RUN = tuple(
-    name
-    for part in (OutputOptions, ResultOptions, MotionOptions, DeviceOptions, ContactOptions)
-    for name in part.__annotations__
-    if name not in ("pull", "twist", "press", "probe", "write_run")
+    option.name
+    for option in options_of(("output", "results", "motion", "device", "contact"))
+    if option.name not in ("pull", "twist", "press", "probe", "write_run")
 )
-
-
-# --- other commands --------------------------------------------------------------------------------------------------
-
-
-@dataclass(kw_only=True)
-class PageOptions:
-    """The page.
-
-    Attributes:
-        host (ADDRESS): address to listen at (default: 127.0.0.1)
-        port (N): port; 0: any free one (8080)
-        token (WORD): word that visitors need, as in http://ADDRESS:N/?token=WORD (default: none on this computer; a
-            random word where others can reach the address)
-    """
-
-    TITLE = "the page"
-
-    host: str = "127.0.0.1"
-    port: WholeNumber = 8080
-    token: str | None = None
-
-
-@dataclass(kw_only=True)
-class ViewOptions(
-    DeviceOptions, RemeshOptions, ContactOptions, MotionOptions, OrganOptions, BodyOptions, PageOptions, InputOptions
-):
-    """A page in place of the files that ``simulate`` writes, which a run file may still name."""
-
-
-@dataclass(kw_only=True)
-class SweepOptions:
-    """All options.
-
-    Attributes:
-        input (INPUT): as for simulate: a run file, a mesh, a surface, a scan or box
-        vary (OPTION=VALUES): an option of simulate and its values: A,B,C, FIRST:LAST:COUNT or FIRST:LAST:COUNT:log; may
-            be repeated
-        probe (WHERE): as for simulate: its motion is a result
-        duration (T): as for simulate
-        output (FOLDER): folder for the results
-        workers (N): processes (default: one a card, or one a core)
-        retries (N): how often a failed run is repeated (default: 2)
-        device: as for simulate
-    """
-
-    input: str = field(metadata={"flags": ("input",)})
-    vary: list[str]
-    probe: list[str] | None = None
-    duration: str | None = None
-    output: Path | None = field(default=None, metadata={"flags": ("-o", "--output")})
-    workers: int | None = None
-    retries: int = 2
-    device: str | None = None
-
-
-@dataclass(kw_only=True)
-class StageFiles:
-    """The stages.
-
-    Attributes:
-        input (INPUT): stage with TetMesh prims (.usd, .usda, .usdc, .usdz)
-        output (OUT.usd): stage to write (.usd, .usdc or .usda)
-    """
-
-    input: Path = field(metadata={"flags": ("input",)})
-    output: Path = field(metadata={"flags": ("-o", "--output")})
-
-
-@dataclass(kw_only=True)
-class StageBodies:
-    """What the stage does not define.
-
-    Attributes:
-        young (E): Young's modulus [Pa] (default: 20 times the weight of a column as high as the body, over its area)
-        poisson (NU): Poisson's ratio (default: 0.45)
-        density (RHO): [kg/m^3] (default: 1000)
-        ground (HEIGHT): height of a ground plane [m]; auto: below the bodies if nothing is held and no collider stays
-            in place (default); or none
-        radius (R): contact radius around each point of soft bodies [m]: half of an edge closes the gaps between points,
-            through which smaller things slip, and keeps bodies that far from others (default: 0)
-        no_soft_contact: soft bodies and cloth pass through one another, which takes less time
-        fix (EXPR): points that are held, for example "z > zmax - 0.01": see simulate --help [m]
-    """
-
-    TITLE = "what the stage does not define"
-
-    young: Pressure | None = None
-    poisson: Number | None = None
-    density: Density | None = None
-    ground: str = "auto"
-    radius: Metres = 0.0
-    no_soft_contact: bool = False
-    fix: str | None = None
-
-
-@dataclass(kw_only=True)
-class StageMotion:
-    """The motion.
-
-    Attributes:
-        gravity (X Y Z): [m/s^2] (default: the stage's, else 9.81 down)
-        viscosity (S): viscous over elastic shear stress of one strain [s] (default: 5 % of critical damping for each
-            body's slowest vibration)
-        damping (C): mass-proportional damping [1/s], which also damps falls (default: 0)
-        duration (T): simulated time [s] (default: 2)
-        fps (F): frames per second (default: the stage's time codes per second, else 24)
-        integrator: explicit: many short steps; implicit: steps of any length, for stiff bodies, by backward Euler,
-            which damps; soft bodies then pass through one another, and there is no cloth (default: explicit)
-        dt: longest time step [s] (default: a safe one; 1/60 s if implicit)
-        rigid: which of Newton's solvers steps rigid bodies and joints (default: semi-implicit)
-    """
-
-    TITLE = "the motion"
-
-    gravity: tuple[Acceleration, Acceleration, Acceleration] | None = None
-    viscosity: Seconds | None = None
-    damping: PerSecond = 0.0
-    duration: Seconds = 2.0
-    fps: Number | None = None
-    integrator: str = one_of("explicit", "implicit", default="explicit")
-    dt: Seconds | None = None
-    rigid: str = one_of("semi-implicit", "xpbd", "none", default="semi-implicit")
-
-
-@dataclass(kw_only=True)
-class StageLook:
-    """The output.
-
-    Attributes:
-        show_stress: colour soft bodies by stress, in place of their materials
-        flatten: write one file that needs no other stage
-    """
-
-    TITLE = "the output"
-
-    show_stress: bool = False
-    flatten: bool = False
-
-
-@dataclass(kw_only=True)
-class SceneOptions(StageLook, StageMotion, StageBodies, StageFiles):
-    """All options.
-
-    Attributes:
-        device: "cpu", "cuda:0", ... (default: a GPU if there is one)
-    """
-
-    device: str | None = None
-
-
-@dataclass(kw_only=True)
-class WarmUpOptions:
-    """All options.
-
-    Attributes:
-        device: "cpu", "cuda:0", ... (default: Warp's choice)
-        all: also all elastic models, remeshing, states of rest and own surfaces
-    """
-
-    device: str | None = None
-    all: bool = False
-
-
-@dataclass(kw_only=True)
-class VerifyOptions:
-    """All options.
-
-    Attributes:
-        cases (CASE): names of cases (default: all)
-        list_cases: list the cases, and run none
-        full: finer meshes and longer times: minutes on a CPU core, where the quick form takes half a minute
-        json (FILE): also write the rows as JSON
-        device: "cpu", "cuda:0", ... (default: Warp's choice)
-    """
-
-    cases: list[str] | None = field(default=None, metadata={"flags": ("cases",), "action": "store", "nargs": "*"})
-    list_cases: bool = field(default=False, metadata={"flags": ("--list",)})
-    full: bool = False
-    json: Path | None = None
-    device: str | None = None
 
 
 # --- the commands ----------------------------------------------------------------------------------------------------
@@ -756,22 +386,22 @@ class Command(NamedTuple):
 
     Attributes:
         line: Its line in the help.
-        options: Its options.
+        groups: The groups of its options in `TABLE`.
         description, epilog: What its own help says before and after them.
-        files: The options that run files may name, too; they have their defaults.
+        files: The groups of the options that run files may name, too; they have their defaults.
     """
 
     line: str
-    options: type
+    groups: tuple[str, ...]
     description: str
     epilog: str | None = None
-    files: type | None = None
+    files: tuple[str, ...] = ()
 
 
 COMMANDS = {
     "simulate": Command(
         "simulate a soft body and write its motion as a USD animation",
-        RunOptions,
+        RUN,
         "Lets a soft body sag and sway under gravity and writes a USD animation, coloured by stress.",
         f"""examples:
   warp-corot simulate warp:bunny -o bunny.usd --preview bunny.gif
@@ -807,7 +437,7 @@ warp:bear, warp:bunny and box have their own defaults for body and motion.
     ),
     "sweep": Command(
         "repeat a run with many combinations of parameters, and write a table of the results",
-        SweepOptions,
+        ("sweep",),
         """Runs INPUT with every combination of the values of --vary, in several processes. The same command \
 continues an interrupted sweep.""",
         """examples:
@@ -819,7 +449,7 @@ the last row of each run's table, and the largest displacement.""",
     ),
     "view": Command(
         "take hold of a soft body in a browser",
-        ViewOptions,
+        ("input", "page", *OF_BODIES, "device"),
         """Opens a page in which a soft body moves and can be dragged, pressed, held and cut with the mouse. \
 Needs websockets: pip install "warp-corot[view]".""",
         """examples:
@@ -835,11 +465,11 @@ exit status:
   0    the page was closed (Ctrl-C)
   2    the input or an option was wrong; no page was opened
   143  terminated (SIGTERM)""",
-        RunOptions,
+        RUN,
     ),
     "scene": Command(
         "step a USD stage: soft bodies, rigid bodies, ground",
-        SceneOptions,
+        ("stage files", "stage bodies", "stage motion", "stage look", "stage device"),
         """Steps the scene of a USD stage and writes a stage over it in which its bodies move, with the stress \
 of every tetrahedron. Needs Newton: pip install "warp-corot[newton]" newton-usd-schemas.""",
         f"""examples:
@@ -867,7 +497,7 @@ what is written, on top of OUT's sublayer INPUT, which must stay beside it unles
     ),
     "warm-up": Command(
         "compile the kernels of frequent runs, so that these start at once",
-        WarmUpOptions,
+        ("warm-up",),
         """\
 Makes short runs of the kinds that simulate and view make most, so that the
 kernels of these are in Warp's cache when you need them. Nothing is written
@@ -875,7 +505,7 @@ elsewhere. Where they already are, the runs take seconds.""",
     ),
     "verify": Command(
         "run cases with known answers, and print a table of results, references and errors",
-        VerifyOptions,
+        ("verify",),
         """\
 Runs cases with known answers on this machine: elastic laws, contact, friction
 and impacts. Prints a table: each result, its reference, how far they are apart,
@@ -884,8 +514,6 @@ how far they may be, and where the reference comes from.""",
 exit status: 0 if all rows pass, 4 if a row does not, else as of simulate.""",
     ),
 }
-#: Values that help texts name.
-_VALUES = vars(choices) | {name: value for name, value in globals().items() if name.isupper()}
 
 
 def add_command(subparsers: Any, name: str) -> argparse.ArgumentParser:
@@ -894,10 +522,10 @@ def add_command(subparsers: Any, name: str) -> argparse.ArgumentParser:
     parser: argparse.ArgumentParser = subparsers.add_parser(
         name, help=command.line, description=command.description, epilog=command.epilog
     )
-    add_declared(parser, command.options)
-    there = {each.name for each in fields(command.options)}
-    more = fields(command.files) if command.files else ()
-    parser.set_defaults(**{each.name: each.default for each in more if each.name not in there})
+    add_options(parser, command.groups)
+    there = {option.name for option in options_of(command.groups)}
+    more = {option.name: option.default for option in options_of(command.files)}
+    parser.set_defaults(**{name: default for name, default in more.items() if name not in there})
     return parser
 
 
@@ -907,8 +535,3 @@ def is_static(args: argparse.Namespace) -> bool:
 
 def integrator_name(args: argparse.Namespace) -> str:
     return args.integrator or "symplectic-euler"
-
-
-def stands_free(args: argparse.Namespace) -> bool:
-    """Whether a ground carries the body in place of fixed nodes."""
-    return args.fix is None and (args.ground is not None or args.drop is not None)

@@ -12,7 +12,7 @@ from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any
+from typing import IO, TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -23,7 +23,7 @@ from warp_corot.contact.tool import Obstacle, Tool
 from warp_corot.errors import InputError
 from warp_corot.inputs.loading import begin_loading
 from warp_corot.io.files.whole import check_output, writing
-from warp_corot.io.pictures.film import FILMS, check_film, frames_shown, write_film
+from warp_corot.io.pictures.preview import FILMS, check_film, frames_shown, write_film
 from warp_corot.simulation.progress import bar_of
 
 from .options import VIEWS, is_static
@@ -33,7 +33,6 @@ if TYPE_CHECKING:
     from PIL.Image import Image
 
     from warp_corot.body.soft_body import SoftBody
-    from warp_corot.io.pictures.colors import VertexAverage
     from warp_corot.io.pictures.preview import Picture
     from warp_corot.simulation.simulation import Simulation
 
@@ -177,29 +176,26 @@ def _felt(obstacle: Obstacle) -> dict[str, float]:
 class DrawnBodies:
     """What is drawn of bodies: their skins and their stresses, bound again when a mesh has changed."""
 
-    def __init__(self, bodies: Sequence[RunBody]):
+    def __init__(self, bodies: Sequence[RunBody], sim: Simulation):
+        from warp_corot.io.write.animate import JoinedBodies
         from warp_corot.io.write.skins import BoundSkins
 
-        self._soft = [body.soft for body in bodies]
-        # All bodies of a simulation can be cut, or none.
-        are_cut = all(soft.changing is not None and soft.changing.is_cut for soft in self._soft)
-        own = [None if are_cut else body.subject.skin for body in bodies]
+        self._joined = joined = JoinedBodies(sim, 0)
+        own = [None if joined.are_cut else body.subject.skin for body in bodies]
         drawn = [skin or body.subject.surface for body, skin in zip(bodies, own, strict=True)]
-        changing = [body.soft.mesh is not body.subject.mesh for body in bodies]
-        self._skins = BoundSkins([soft.mesh for soft in self._soft], drawn, changing=changing, are_cut=are_cut)
-        self._averages: dict[int, tuple[Any, VertexAverage]] = {}
+        self._skins = BoundSkins(joined.meshes, drawn, changing=joined.changing, are_cut=joined.are_cut)
 
     def frame(self, sim: Simulation) -> Picture:
         """The current state; values are NaN on obstacles."""
         from warp_corot.io.pictures.preview import Picture
-        from warp_corot.io.write.solids import ground_corners, poses_of, shape_of, solid_of
+        from warp_corot.io.write.skins import ground_corners, poses_of, shape_of, solid_of
 
-        u = np.concatenate([soft.displacements.numpy() for soft in self._soft])
-        held = np.concatenate([soft.constrained.astype(float) for soft in self._soft])
-        stress = np.concatenate([self._stress(k, sim) for k in range(len(self._soft))])
+        self._joined.has_changed()
+        u, held = self._joined.nodal("displacements"), self._joined.fixed.astype(float)
+        stress = self._joined.average(self._joined.von_mises(sim))
         parts: list[tuple[np.ndarray, ...]] = [
             (skin.surface.moved(u), skin.surface.triangles, skin.values(stress), skin.surface.points, skin.values(held))
-            for skin in self._skins.on([soft.mesh for soft in self._soft])
+            for skin in self._skins.on(self._joined.meshes)
         ]
         rests, ground = np.concatenate([part[3] for part in parts]), np.zeros((0, 3))
         obstacles = () if sim.contact is None else sim.contact.obstacles.given
@@ -220,17 +216,6 @@ class DrawnBodies:
             np.concatenate(rest),
             options=marks,
         )
-
-    def _stress(self, k: int, sim: Simulation) -> np.ndarray:
-        """Von Mises stress at the nodes of a body [Pa], [N]."""
-        from warp_corot.io.pictures.colors import VertexAverage
-        from warp_corot.mesh.topology import signed_volumes
-
-        mesh = self._soft[k].mesh
-        if k not in self._averages or self._averages[k][0] is not mesh:
-            volumes = np.abs(signed_volumes(mesh.points, mesh.tets))
-            self._averages[k] = mesh, VertexAverage(mesh.tets, volumes, len(mesh.points))
-        return self._averages[k][1](sim.von_mises(self._soft[k]))
 
 
 # --- pictures of frames from several sides, or a film of all of them -------------------------------------------------
@@ -280,7 +265,7 @@ class Previews:
             return
         if self._file is None:
             self._file = tempfile.TemporaryFile()  # noqa: SIM115 (closed with this object)
-            self._bodies = DrawnBodies(bodies)
+            self._bodies = DrawnBodies(bodies, sim)
         shown = self._bodies.frame(sim)
         pickle.dump((sim.time, shown), self._file, pickle.HIGHEST_PROTOCOL)
         used = np.unique(shown.faces)

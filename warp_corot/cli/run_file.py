@@ -6,28 +6,20 @@ import argparse
 import json
 import os
 import tomllib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from difflib import get_close_matches
+from functools import cache
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 from warp_corot.errors import InputError
 from warp_corot.io.files.whole import check_output, written_whole
 
-from .options import LOADS, OF_THE_RUN, RunOptions, StrictParser, add_declared
+from .options import LOADS, OF_THE_RUN, RUN, Option, options_of
 from .patches import Load, value_of
 
 #: Keys in tables of loads, besides times and shares.
 VALUES = {"pull": "by", "twist": "degrees", "press": "pressure"}
-
-
-class _Parser(StrictParser):
-    """Reports errors in a file."""
-
-    path = Path()
-
-    def error(self, message: str) -> NoReturn:
-        raise InputError(f"{self.path}: {message}")
 
 
 def bodies_of(args: argparse.Namespace) -> list[argparse.Namespace]:
@@ -52,10 +44,9 @@ def bodies_of(args: argparse.Namespace) -> list[argparse.Namespace]:
         raise InputError(f"{path}: 'body' must be tables, each below a line [[body]]")
     for key in (key for table in tables for key in table if key in OF_THE_RUN):
         raise InputError(f"{path}: {key!r} is for the whole run; it must stand above the first [[body]]")
-    parser, actions = _parser(path)
-    asked = {name: getattr(args, name) for name, action in actions.items() if getattr(args, name) != action.default}
+    asked = {name: getattr(args, name) for name, option in known().items() if getattr(args, name) != option.default}
     del asked["input"]
-    return [_body_of(parser, actions, {**data, **table}, asked, path) for table in tables]
+    return [_body_of({**data, **table}, asked, path) for table in tables]
 
 
 def write_run(path: Path, bodies: Sequence[argparse.Namespace]) -> None:
@@ -65,13 +56,12 @@ def write_run(path: Path, bodies: Sequence[argparse.Namespace]) -> None:
         OSError: It cannot be written.
         InputError: A value that TOML cannot hold.
     """
-    _, actions = _parser(path)
     folder = path.parent
     if len(bodies) == 1:
-        lines = _lines(bodies[0], actions, folder)
+        lines = _lines(bodies[0], known(), folder)
     else:
-        lines = _lines(bodies[0], {name: actions[name] for name in OF_THE_RUN}, folder)
-        own = {name: action for name, action in actions.items() if name not in OF_THE_RUN}
+        lines = _lines(bodies[0], OF_THE_RUN, folder)
+        own = [name for name in known() if name not in OF_THE_RUN]
         for body in bodies:
             lines += ["", "[[body]]", *_lines(body, own, folder)]
     try:
@@ -101,91 +91,92 @@ def option_of(name: str) -> Callable[[str], Any]:
         InputError: There is no such option, or it does not have one value. The function raises it for a text that the
             option does not accept.
     """
-    _, actions = _parser(Path("--vary"))
-    action = actions.get(name)
-    if action is None or action.nargs is not None or not action.option_strings:
+    option = known().get(name)
+    if option is None or "nargs" in option.settings or not option.flags[0].startswith("-") or option.is_flag:
         raise InputError(f"--vary: {name!r} is not an option with one value; see warp-corot simulate --help")
-    kind = action.type if callable(action.type) else str
-
-    def read(text: str) -> Any:
-        try:
-            return kind(text.strip())
-        except (argparse.ArgumentTypeError, ValueError) as error:
-            raise InputError(f"--vary: {name}: {error}") from None
-
-    return read
+    return lambda text: _one(option, text.strip(), "--vary")
 
 
-def _parser(path: Path) -> tuple[_Parser, dict[str, argparse.Action]]:
-    parser = _Parser(add_help=False, prog="simulate")
-    parser.path = path
-    add_declared(parser, RunOptions)
-    return parser, {action.dest: action for action in parser._actions if action.dest != "write_run"}
+@cache
+def known() -> dict[str, Option]:
+    """The options that run files may name."""
+    return {option.name: option for option in options_of(RUN) if option.name != "write_run"}
 
 
-def _body_of(
-    parser: _Parser, actions: dict[str, argparse.Action], table: dict[str, Any], asked: dict[str, Any], path: Path
-) -> argparse.Namespace:
+def _body_of(table: dict[str, Any], asked: dict[str, Any], path: Path) -> argparse.Namespace:
     """The options in a table of the file, and those of the command line, which replace them or are added to them."""
     if "input" not in table:
         raise InputError(f"{path}: a body has no 'input'; it must have one")
-    body = argparse.Namespace(**{name: action.default for name, action in actions.items()}, curves=[], write_run=None)
+    body = argparse.Namespace(**{name: option.default for name, option in known().items()}, curves=[], write_run=None)
     for key, value in table.items():
         name = key.replace("-", "_")
-        if name not in actions:
-            likely = "".join(f", {near!r} is" for near in get_close_matches(name, actions, 1))
+        if name not in known():
+            likely = "".join(f", {near!r} is" for near in get_close_matches(name, known(), 1))
             raise InputError(f"{path}: {key!r} is not an option{likely}; see warp-corot simulate --help")
+        option = known()[name]
         if name in LOADS and isinstance(value, list):
             body.curves += [_load(name, entry, path) for entry in value if isinstance(entry, dict)]
             value = [entry for entry in value if not isinstance(entry, dict)]
-        if _is_path(actions[name]):
-            several = _is_list(actions[name]) and isinstance(value, list)
+        if _is_path(option):
+            several = option.is_list and isinstance(value, list)
             value = [_beside(one, path, name) for one in value] if several else _beside(value, path, name)
         try:
-            setattr(body, name, _value_of(parser, actions[name], value))
+            setattr(body, name, _value_of(option, value, path))
         except TypeError:
             raise InputError(f"{path}: {key} = {value!r} does not fit the option") from None
     for name, value in asked.items():
-        setattr(body, name, [*(getattr(body, name) or ()), *value] if _is_list(actions[name]) else value)
+        setattr(body, name, [*(getattr(body, name) or ()), *value] if known()[name].is_list else value)
     return body
 
 
-def _value_of(parser: _Parser, action: argparse.Action, value: Any) -> Any:
+def _value_of(option: Option, value: Any, path: Path) -> Any:
     """The value of an option from that of its key.
 
     Raises:
         TypeError: Its type does not fit the option.
     """
-    if isinstance(value, bool) and action.nargs in (0, "?"):
-        return value if action.nargs == 0 else action.const if value else action.default
-    if action.nargs == 0:
+    if isinstance(value, bool) and (option.is_flag or "const" in option.settings):
+        return value if option.is_flag else option.settings["const"] if value else option.default
+    if option.is_flag:
         raise TypeError
-    if _is_list(action):
-        return [_read(parser, action, entry) for entry in (value if isinstance(value, list) else [value])] or None
-    return _read(parser, action, value)
+    if option.is_list:
+        return [_read(option, entry, path) for entry in (value if isinstance(value, list) else [value])] or None
+    return _read(option, value, path)
 
 
-def _read(parser: _Parser, action: argparse.Action, value: Any) -> Any:
-    """A value or values as argparse reads their texts."""
-    words = value if isinstance(action.nargs, int) else [value]
+def _read(option: Option, value: Any, path: Path) -> Any:
+    """A value, or the values of an option with several."""
+    count = option.settings.get("nargs")
+    words = value if isinstance(count, int) else [value]
     if not isinstance(words, list) or any(isinstance(word, bool | list | dict) for word in words):
         raise TypeError
+    if isinstance(count, int) and len(words) != count:
+        raise InputError(f"{path}: argument {option.flags[-1]}: expected {count} arguments")
+    read = [_one(option, str(word), path) for word in words]
+    return read if isinstance(count, int) else read[0]
+
+
+def _one(option: Option, text: str, where: object) -> Any:
+    """The value in a text.
+
+    Raises:
+        InputError: The option does not accept it; the message begins with where it stands.
+    """
     try:
-        if isinstance(action.nargs, int) and len(words) != action.nargs:
-            raise argparse.ArgumentError(action, f"expected {action.nargs} arguments")
-        return parser._get_values(action, [str(word) for word in words])
-    except argparse.ArgumentError as error:
-        parser.error(str(error))
+        if text == "--":
+            raise ValueError("'--' is not a value")
+        value = option.settings["type"](text)
+    except (argparse.ArgumentTypeError, ValueError) as error:
+        raise InputError(f"{where}: argument {option.flags[-1]}: {error}") from None
+    listed = option.settings.get("choices")
+    if listed and value not in listed:
+        raise InputError(f"{where}: argument {option.flags[-1]}: {text!r} is none of {', '.join(listed)}")
+    return value
 
 
-def _is_list(action: argparse.Action) -> bool:
-    """Whether an option can be given several times."""
-    return isinstance(action, argparse._AppendAction)
-
-
-def _is_path(action: argparse.Action) -> bool:
+def _is_path(option: Option) -> bool:
     """Whether an option's value is a path, which is relative to the run file."""
-    return action.type is Path or action.dest == "input"
+    return option.settings.get("type") is Path or option.name == "input"
 
 
 def _beside(value: Any, path: Path, name: str) -> Any:
@@ -215,21 +206,20 @@ def _load(kind: str, table: dict[str, Any], path: Path) -> Load:
     return Load(kind, str(table["patch"]), values, times, shares, axis)
 
 
-def _lines(body: argparse.Namespace, actions: dict[str, argparse.Action], folder: Path) -> list[str]:
+def _lines(body: argparse.Namespace, names: Iterable[str], folder: Path) -> list[str]:
     lines = []
-    for name, action in actions.items():
-        value = getattr(body, name)
+    for name in names:
+        option, value = known()[name], getattr(body, name)
         curves = [_table(load) for load in getattr(body, "curves", ()) if load.kind == name]
-        if value == action.default and not curves:
+        if value == option.default and not curves:
             continue
-        if _is_path(action):
+        if _is_path(option):
             several = isinstance(value, list)
             value = [_relative(str(one), folder, name) for one in (value if several else [value])]
             value = value if several else value[0]
-        key = action.option_strings[-1].lstrip("-") if action.option_strings else name
         if name in LOADS:
             value = [*([patch, *map(_number, texts)] for patch, *texts in value or ()), *curves]
-        lines.append(f"{key} = {_toml(value)}")
+        lines.append(f"{option.flags[-1].lstrip('-')} = {_toml(value)}")
     return lines
 
 

@@ -14,20 +14,8 @@ from warp_corot.body.soft_body import SoftBody
 from warp_corot.cutting.blade import Blade
 from warp_corot.elasticity import Corotated
 from warp_corot.errors import InputError, UnstableError
-from warp_corot.inputs.device import checked_device
-from warp_corot.inputs.loading import (
-    BODY,
-    CONTACT,
-    CONTACT_ON_CPU,
-    EXPLICIT,
-    IMPLICIT,
-    IMPLICIT_ON_FORESTS,
-    MESHING,
-    STEPS,
-    STEPS_ON_CPU,
-    SURFACES,
-    begin_loading,
-)
+from warp_corot.inputs import loading
+from warp_corot.inputs.checks import checked_device
 from warp_corot.inputs.stopwatch import WATCH
 from warp_corot.mesh import TetForest
 from warp_corot.simulation.resting import bring_to_rest
@@ -35,14 +23,12 @@ from warp_corot.simulation.simulation import Simulation
 from warp_corot.simulation.static import solve_static
 from warp_corot.solvers import INTEGRATORS, BackwardEuler, Integrator, QuasiStatic, SymplecticEuler
 
-from .bodies import REMESH_ARGUMENTS, RunBody, asked_bodies, find_body, find_patches, gravity_of, make_body
-from .contact import RunContact, place_ground, say_overlaps, say_reach, touched_by
+from .bodies import RunBody, asked_bodies, find_body, find_patches, gravity_of, make_body
+from .contact import RunContact, make_blade, place_ground, say_overlaps, say_reach, touched_by
 from .options import IMPLICIT_DT, integrator_name, is_static
 from .patches import press_patches, ramp_of
-from .ranks import are_several
 from .results import Probe
-from .terminal import as_options, complain, tell_compiling, waiting
-from .tool_paths import make_blade
+from .terminal import are_several, complain, tell_compiling, waiting
 
 #: The command warns that a run will take long if a frame has more steps than this.
 MANY_STEPS = 1e5
@@ -103,7 +89,7 @@ def _made_ready(options: Sequence[argparse.Namespace], touches: bool, chooses: b
             inputs.append(asked_bodies(each))
     bodies = [body for found in inputs for body in found]
     tell_compiling(device)
-    begin_loading(_modules(bodies, touches or touched.contact is not None, chooses, device), device)
+    loading.begin_loading(_modules(bodies, touches or touched.contact is not None, chooses, device), device)
     for body in bodies:
         with waiting(f"meshing {body.args.input}"):
             body.subject = find_body(body)
@@ -133,13 +119,15 @@ def _made_ready(options: Sequence[argparse.Namespace], touches: bool, chooses: b
 def _modules(bodies: Sequence[RunBody], touches: bool, chooses: bool, device: wp.Device) -> list[str]:
     """Modules of kernels that the run is known to launch, in the order in which it needs them."""
     meshed = any(body.opened.kind in ("surface", "scan") for body in bodies)
-    names = [*SURFACES, *MESHING] if meshed else []
+    names = [*loading.SURFACES, *loading.MESHING] if meshed else []
     explicit = not INTEGRATORS[integrator_name(bodies[0].args)].is_implicit
-    contact, steps = (CONTACT_ON_CPU, STEPS_ON_CPU) if device.is_cpu else (CONTACT, STEPS)
-    names += [*BODY, *(contact if touches and explicit else ()), *steps]
+    contact, steps = (
+        (loading.CONTACT_ON_CPU, loading.STEPS_ON_CPU) if device.is_cpu else (loading.CONTACT, loading.STEPS)
+    )
+    names += [*loading.BODY, *(contact if touches and explicit else ()), *steps]
     if meshed and not touches and chooses and may_choose(bodies):
-        return [*names, *IMPLICIT, *IMPLICIT_ON_FORESTS]
-    return [*names, *(EXPLICIT if explicit else ())]
+        return [*names, *loading.IMPLICIT, *loading.IMPLICIT_ON_FORESTS]
+    return [*names, *(loading.EXPLICIT if explicit else ())]
 
 
 def _frames(args: argparse.Namespace, bodies: Sequence[RunBody], touched: RunContact) -> tuple[float, int]:
@@ -186,25 +174,19 @@ def make_simulation(args: argparse.Namespace, bodies: Sequence[RunBody], touched
         steps = steps_per_frame(args.fps, args.dt or tried)  # refuses an excessive number
         integrator = SymplecticEuler(None if args.dt is None else 1.0 / (args.fps * steps), damping, viscosity)
     cuts = blades_of(args, bodies)
-    with as_options(REMESH_ARGUMENTS):
-        made: Simulation = (_on_ranks() if are_several() else Simulation)(
-            bodies=[body.soft for body in bodies],
-            model=[body.model for body in bodies],
-            integrator=integrator,
-            gravity=gravity_of(args, first),
-            remesh=[body.remesh for body in bodies] if any(body.remesh for body in bodies) else None,
-            obstacles=list(touched.obstacles.values()),
-            contact=touched.contact,
-            cuts=cuts or None,
-        )
-        return made
-
-
-def _on_ranks() -> type[Simulation]:
-    """The simulation that all ranks step."""
-    from warp_corot.distributed import Simulation as OnRanks
-
-    return OnRanks
+    kind = Simulation
+    if are_several():
+        from warp_corot.distributed import Simulation as kind
+    return kind(
+        bodies=[body.soft for body in bodies],
+        model=[body.model for body in bodies],
+        integrator=integrator,
+        gravity=gravity_of(args, first),
+        remesh=[body.remesh for body in bodies] if any(body.remesh for body in bodies) else None,
+        obstacles=list(touched.obstacles.values()),
+        contact=touched.contact,
+        cuts=cuts or None,
+    )
 
 
 def blades_of(args: argparse.Namespace, bodies: Sequence[RunBody]) -> list[Blade]:
@@ -232,8 +214,7 @@ def _tried_step(one: RunBody, damping: float, viscosity: float) -> float:
         tried, remesh = SoftBody(body.mesh, body.material, device=body.device, threads=1), replace(remesh, every=1)
         tried.fix(body.constrained)
     integrator = SymplecticEuler(damping=damping, viscosity=viscosity)
-    with as_options(REMESH_ARGUMENTS):
-        trial = Simulation(tried, model=model, integrator=integrator, gravity=(0, 0, 0), remesh=remesh)
+    trial = Simulation(tried, model=model, integrator=integrator, gravity=(0, 0, 0), remesh=remesh)
     dt = trial.dt
     trial.step()
     trial.von_mises()

@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from warp_corot.domain.units import length
+from warp_corot.domain.units import length, pressure
 from warp_corot.errors import InputError, UnstableError
-from warp_corot.inputs.device import checked_device
+from warp_corot.inputs.checks import checked_device
 from warp_corot.inputs.stopwatch import WATCH
 
-from .summary import aligned, milliseconds, pressure, speed, unfinished, wall_time
+from .simulate import aligned, milliseconds, speed, unfinished, wall_time
 from .terminal import complain, early_end, tell_compiling
 
 if TYPE_CHECKING:
@@ -29,15 +29,7 @@ def run(args: argparse.Namespace) -> int:
     Raises:
         InputError: Newton is missing, bad options, or a bad stage; nothing was simulated or written.
     """
-    from warp_corot.io.write.animate import (
-        Recording,
-        closed_whole,
-        frame_count,
-        progress_bar,
-        rounding,
-        shortening,
-        signals_held_back,
-    )
+    from warp_corot.io.write import animate
     from warp_corot.io.write.usd.pieces import PieceStore
     from warp_corot.newton.stages.stage import StageOptions
     from warp_corot.newton.stages.steps import StageSimulation
@@ -55,7 +47,7 @@ def run(args: argparse.Namespace) -> int:
         not args.no_soft_contact,
     )
     if args.fps is not None:
-        frame_count(args.duration, args.fps)
+        animate.frame_count(args.duration, args.fps)
     PieceStore(args.output)  # checks the path, and writes nothing before the first frame
     device = checked_device(args.device)
     tell_compiling(device)
@@ -69,19 +61,19 @@ def run(args: argparse.Namespace) -> int:
         integrator=args.integrator,
         device=device,
     )
-    count = frame_count(args.duration, sim.fps)
+    count = animate.frame_count(args.duration, sim.fps)
     writer = sim.writer(args.output, show_stress=args.show_stress, flatten=args.flatten)
-    shortened = None if args.dt is None else shortening(args.dt, sim.fps)
-    for note in filter(None, [*sim.parts.notes, rounding(args.duration, sim.fps), shortened]):
+    shortened = None if args.dt is None else animate.shortening(args.dt, sim.fps)
+    for note in filter(None, [*sim.parts.notes, animate.rounding(args.duration, sim.fps), shortened]):
         complain(note, kind="note")
-    done = Recording(writer.path)
+    done = animate.Recording(writer.path)
     try:
-        with closed_whole(writer, done), progress_bar(count) as progress:
+        with animate.closed_whole(writer, done), animate.progress_bar(count) as progress:
             for frame in range(count + 1):
                 if frame:
                     with WATCH.part("stepping", into=done):
                         sim.advance()
-                with WATCH.part("writing", into=done), signals_held_back():
+                with WATCH.part("writing", into=done), animate.signals_held_back():
                     writer.write(sim.show())
                     done.frames, done.simulated, done.steps = writer.frames, sim.time, sim.frames * sim.steps
                 progress(frame, count)

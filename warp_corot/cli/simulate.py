@@ -1,4 +1,4 @@
-"""``warp-corot simulate``: a mesh in, an animation out."""
+"""``warp-corot simulate``: a mesh in, an animation out, and a summary at the end."""
 
 from __future__ import annotations
 
@@ -6,24 +6,40 @@ import argparse
 import hashlib
 from collections.abc import Sequence
 from contextlib import closing, nullcontext
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from warp_corot.errors import InputError, UnstableError
-from warp_corot.inputs.stopwatch import WATCH
-from warp_corot.simulation.simulation import Simulation
+import numpy as np
 
-from .bodies import RunBody
+from warp_corot.domain.units import length, pressure
+from warp_corot.elasticity import MODELS
+from warp_corot.elasticity.dilatation import ELEMENT, shares_dilatation
+from warp_corot.errors import InputError, UnstableError
+from warp_corot.holding.choice import NAMED
+from warp_corot.inputs.processes import process_count
+from warp_corot.inputs.stopwatch import KERNELS, WATCH
+from warp_corot.mesh import TetForest
+from warp_corot.simulation.energy import Solves
+from warp_corot.simulation.simulation import Simulation
+from warp_corot.solvers import INTEGRATORS
+
+from . import terminal
+from .options import is_static
 from .results import Previews, Table, check_preview
 from .run_file import bodies_of, check_run_path, write_run
 from .run_setup import RunSetup, rest, set_up
-from .summary import summary, title_of
 from .terminal import early_end
 
 if TYPE_CHECKING:
+    from warp_corot.discretization.elements import Mesh
     from warp_corot.io.write.animate import Progress, Recording
     from warp_corot.io.write.skins import OwnSurface
+    from warp_corot.materials.isotropic import Isotropic
     from warp_corot.mesh.surfaces.bound import SurfaceMesh
+
+    from .bodies import RunBody
+    from .input_mesh import InputMesh
 
 
 def run(args: argparse.Namespace) -> int:
@@ -49,7 +65,7 @@ def run(args: argparse.Namespace) -> int:
         _record(args, shared, ready, done, table, previews)
         if previews is not None:
             with WATCH.part("drawing"):
-                previews.draw(ready.bodies, title_of(ready.bodies, ready.sim.gravity))
+                previews.draw(ready.bodies, title_of(ready.bodies))
     except (KeyboardInterrupt, UnstableError, OSError) as error:
         return early_end(error, done)
     print(summary(ready.bodies, ready.sim, done, ready.touched.rows, rested))
@@ -79,8 +95,8 @@ def simulated(args: argparse.Namespace) -> Recording:
 def _check_output(args: argparse.Namespace, shared: argparse.Namespace) -> None:
     """Check, before a long run, that its results can be written."""
     from warp_corot.io.files.whole import check_output
-    from warp_corot.io.write import check_also
     from warp_corot.io.write.animate import frame_count
+    from warp_corot.io.write.paraview import check_also
     from warp_corot.io.write.usd.pieces import PieceStore
 
     if shared.output is None:
@@ -198,3 +214,221 @@ def _hash(path: Path) -> str:
 
 def _text(text: str) -> str:
     return text.encode("utf-8", errors=_ERRORS).decode("utf-8")
+
+
+#: Maximum number of regions whose materials are listed.
+MOST_KINDS = 8
+
+
+def summary(
+    bodies: Sequence[RunBody],
+    sim: Simulation,
+    done: Recording,
+    touched: Sequence[tuple[str, str]] = (),
+    rested: Sequence[str] = (),
+) -> str:
+    """The run in a dozen lines.
+
+    Args:
+        bodies: The bodies.
+        sim: The simulation at its end.
+        done: The recording.
+        touched: Lines on what the bodies touch.
+        rested: Lines on the static answers of the bodies.
+    """
+    shared = bodies[0].args
+    static = is_static(shared)
+    integrator = asdict(sim.integrator)  # type: ignore[call-overload]
+    damping = "" if static else f", damping {integrator['damping']:g} /s"
+    if integrator["viscosity"]:
+        damping += f", viscosity {integrator['viscosity']:g} s"
+    height = max(body.subject.height for body in bodies)
+    at_end = f"{length(done.final_displacement)} at the end ({done.final_displacement / height:.1%} of the height)"
+    shown = "" if static else f", {done.simulated:.4g} s"
+    lines, ranks = [], process_count()
+    for body in bodies:
+        lines += [f"{body.subject.name}, {body.held.words}", *aligned(_body_rows(body))]
+    rows = [
+        *remesh_rows(sim, done),
+        *touched,
+        ("gravity", f"{' '.join(f'{g:g}' for g in sim.gravity)} m/s^2{damping}"),
+        *[("static", f"the first frame is {line}" if done.steps else line) for line in rested],
+        *_time_step(sim, done, static),
+        ("wall time", wall_time()),
+        ("displacement", f"{length(done.largest_displacement)} largest, {at_end}"),
+        ("device", f"{sim.device} ({sim.device.name})" + (f", {ranks} ranks" if ranks > 1 else "")),
+        ("written", f"{done.path}, {done.frames} frame{'s' * (done.frames > 1)}{shown}"),
+    ]
+    rows += [("also written", str(path)) for path in shared.also or ()]
+    for name, path in (("preview", shared.preview), ("table", shared.csv)):
+        if path:
+            rows.append((name, str(path)))
+    return "\n".join([*lines, *([] if len(bodies) == 1 else ["all together"]), *aligned(rows)])
+
+
+def wall_time() -> str:
+    """The wall time of the command so far, and its parts."""
+    WATCH.switch("preparing")
+    names = {KERNELS: "compiling kernels" if terminal.has_compiled else "loading kernels"}
+    parts = [f"{spent:.2f} s {names.get(part, part)}" for part, spent in WATCH.parts.items() if spent >= 0.005]
+    return f"{sum(WATCH.parts.values()):.2f} s: {', '.join(parts)}"
+
+
+def names_of(bodies: Sequence[RunBody]) -> str:
+    """The names of the first bodies, and the number of others."""
+    left = len(bodies) - NAMED
+    return ", ".join(body.subject.name for body in bodies[:NAMED]) + (f" and {left} more" if left > 0 else "")
+
+
+def title_of(bodies: Sequence[RunBody]) -> str:
+    """The title of a picture: the bodies, their elements and their stiffness."""
+    words = [names_of(bodies)]
+    if not any(body.remesh for body in bodies):
+        words.append(f"{sum(len(body.soft.mesh.tets) for body in bodies):,} elements")
+    young = np.unique(np.concatenate([np.ravel(body.soft.material.isotropic.young) for body in bodies]))
+    words += [pressure(float(young[0]))] if len(young) == 1 else []
+    return ", ".join([*words, *(["at rest"] if is_static(bodies[0].args) else [])])
+
+
+def _body_rows(body: RunBody) -> list[tuple[str, str]]:
+    model = next(name for name, kind in MODELS.items() if type(body.model) is kind)
+    level = getattr(body.model, "rotation_level", None)
+    words = [model] if level is None else [model, f"rotations of level {level}"]
+    if shares_dilatation(getattr(body.model, "dilatation", ELEMENT), body.soft.discretization):
+        words.append("shared dilatation")
+    rows = [
+        *_body(body.subject),
+        *_materials(body.subject, body.soft.mesh, body.soft.material),
+        ("model", ", ".join(words)),
+        ("fixed", f"{body.held.count} nodes, {body.held.words}" if body.held.count else "nothing"),
+    ]
+    return rows + [("" if number else "moved", str(load)) for number, load in enumerate(body.loads)]
+
+
+def aligned(rows: Sequence[tuple[str, str]]) -> list[str]:
+    """Lines with a name and a text."""
+    return [f"  {name:<14}{text}" for name, text in rows]
+
+
+def _body(subject: InputMesh) -> list[tuple[str, str]]:
+    """For a body from a surface or a scan, the reports of its domain and its mesh, and their time."""
+    if subject.domain is None:
+        nodes, repaired = len(subject.mesh.points), getattr(subject.mesh, "repaired", 0)
+        unused = nodes - len(subject.used)
+        remarks = [f"{repaired} wound wrongly and repaired"] if repaired else []
+        remarks += [f"{unused} nodes in no tetrahedron"] if unused else []
+        said = f" ({', '.join(remarks)})" if remarks else ""
+        return [("mesh", f"{nodes} nodes, {len(subject.mesh.tets)} tetrahedra{said}")]
+    assert isinstance(subject.mesh, TetForest)
+    took = ", ".join(f"{stage} {seconds:.2f} s" for stage, seconds in subject.times.items())
+    rows = [*_block("domain", subject.domain.report()), *_block("mesh", subject.mesh.summary())]
+    if subject.fidelity is not None:
+        rows += _block("true to it", subject.fidelity.report())
+    if subject.surface is not None:
+        rows.append(("surface", f"{len(subject.surface.points)} points, {len(subject.surface.triangles)} triangles"))
+    return [*rows, ("ready in", f"{sum(subject.times.values()):.2f} s: {took}")]
+
+
+def _block(name: str, lines: list[str]) -> list[tuple[str, str]]:
+    return [(name if first else "", line) for first, line in zip([True] + len(lines) * [False], lines, strict=False)]
+
+
+def _materials(subject: InputMesh, mesh: Mesh, material: Isotropic) -> list[tuple[str, str]]:
+    values = [np.ravel(getattr(material, name)) for name in ("young", "poisson", "density")]
+    if not subject.labels and all(len(value) == 1 for value in values):
+        return [("material", values_line(*(value[0] for value in values)))]
+    if not subject.labels:
+        kinds, counts = np.unique(np.stack(np.broadcast_arrays(*values)), axis=1, return_counts=True)
+        ordered = sorted(zip(counts.tolist(), kinds.T.tolist(), strict=True), reverse=True)
+        return _block(
+            "material", [f"{values_line(*kind)} in {count} tetrahedra" for count, kind in ordered[:MOST_KINDS]]
+        )
+    lines = []
+    for label in subject.labels:
+        of_label = np.flatnonzero(mesh.elements_of(label.name))
+        if len(of_label):
+            one = (getattr(material, name)[of_label[0]] for name in ("young", "poisson", "density"))
+            lines.append(f"{label.name}: {values_line(*one)}")
+        else:
+            lines.append(f"{label.name}: in no tetrahedron")
+    assert mesh.labels is not None
+    others = ~np.isin(mesh.labels, [1 + mesh.label_names.index(label.name) for label in subject.labels])
+    if others.any():
+        first = np.flatnonzero(others)[0]
+        one = (getattr(material, name)[first] for name in ("young", "poisson", "density"))
+        lines.append(f"all others: {values_line(*one)}")
+    return _block("material", lines)
+
+
+def values_line(young: float, poisson: float, density: float) -> str:
+    return f"E = {pressure(float(young))}, nu = {poisson:g}, rho = {density:g} kg/m^3"
+
+
+def _time_step(sim: Simulation, done: Recording, static: bool) -> list[tuple[str, str]]:
+    """The length of steps, their limit or the iterations that they needed, and the speed; states of rest have no
+    steps in time."""
+    found = solved(sim, static)
+    rows = [("solves", found)] if found else []
+    if static:
+        return rows
+    if sim.integrator.is_implicit:
+        name = next(name for name, kind in INTEGRATORS.items() if type(sim.integrator) is kind)
+        step = f"{milliseconds(sim.dt)}, {name}"
+    else:
+        at_last = " (at the end)" if sim.remeshing.every else ""
+        step = f"{_steps(sim)}; largest stable one at rest about {milliseconds(sim.stable_dt)}{at_last}"
+    return [("time step", step), *rows, ("speed", speed(done))]
+
+
+def speed(done: Recording) -> str:
+    """The speed of stepping, in words."""
+    stepping = max(done.stepping, 1e-9)
+    return f"{done.steps / stepping:.0f} steps/s, {done.simulated / stepping:.3g} times real time"
+
+
+def _steps(sim: Simulation) -> str:
+    shortest, longest = sim.dt_range
+    if sim.integrator.dt is not None:
+        return f"{milliseconds(shortest)}, as given"
+    if shortest > 0.99 * longest:
+        return milliseconds(longest)
+    return f"{milliseconds(shortest)} to {milliseconds(longest)}, following the state"
+
+
+def milliseconds(seconds: float) -> str:
+    return f"{1e3 * seconds:.4g} ms"
+
+
+def remesh_rows(sim: Simulation, done: Recording) -> list[tuple[str, str]]:
+    """The mesh's changes for the summary; empty without remeshing."""
+    changing = sim.remeshing.changing[0]
+    if changing is None or not done.elements:
+        return []
+    options, first, last = changing.options, done.elements[0], done.elements[-1]
+    limits = f"above {options.refine_above:g}, below {options.simplify_below:g}"
+    low = "that of the start" if options.min_level is None else options.min_level
+    levels = f"levels {low} to {options.max_level}"
+    counts = f"{first} tetrahedra in the first frame, {max(done.elements)} at most, {last} in the last"
+    return [("remeshing", counts), ("", f"every {options.every} steps, {limits}, {levels}")]
+
+
+# --- the cost of implicit steps --------------------------------------------------------------------------------------
+
+
+def solved(sim: Simulation, static: bool) -> str | None:
+    """The cost of implicit steps, or of the states of rest after the first, in words; None for explicit ones."""
+    solves = sim.solves
+    if solves is None or not solves.steps:
+        return None
+    words = f"{solves.iterations / solves.steps:.3g} iterations of Newton's method"
+    words += f" and {solves.linear_iterations / solves.steps:.3g} linear ones a {'frame' if static else 'step'}"
+    if static:
+        return words + unfinished(solves, "later frames", "show more frames (--fps), which are nearer to one another")
+    return words + unfinished(solves, "steps", "shorten the steps (--dt), or raise linear_iterations in Python")
+
+
+def unfinished(solves: Solves, what: str, cure: str) -> str:
+    """The number of unfinished solves, and what helps; empty if there are none."""
+    if not solves.unfinished:
+        return ""
+    return f"; {solves.unfinished} of {solves.steps} {what} ended before their linear solve converged; {cure}"

@@ -1,4 +1,4 @@
-"""What a command tells its terminal: exit statuses and the line with the reason, signals, waiting, compiling."""
+"""What a command tells its terminal: exit statuses and the reason, signals, waiting, compiling; on several ranks."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ import re
 import signal
 import sys
 import threading
-import warnings
-from collections.abc import Iterator, Mapping
+import time
+from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext, suppress
-from dataclasses import fields
 from types import FrameType
 from typing import TYPE_CHECKING, Any, TextIO
 
 from warp_corot.errors import InputError, UnstableError
+from warp_corot.inputs.processes import process_count, process_number
 from warp_corot.inputs.stopwatch import KERNELS, WATCH
 
 if TYPE_CHECKING:
@@ -34,34 +34,23 @@ def interrupt_status(signalled: KeyboardInterrupt) -> int:
     return 128 + (signal.SIGTERM if isinstance(signalled, Terminated) else signal.SIGINT)
 
 
-def as_option(message: str) -> str:
-    """Turn a message that begins with an argument of Python into one about the option with this name."""
-    from .options import RunOptions
+#: Arguments of Python that the options name otherwise.
+NAMED = {"target_elements": "--tets", "every": "--remesh-every"}
+NAMED |= {f"{end}_level": f"--remesh-levels {end.upper()}" for end in ("min", "max")}
 
-    names = "|".join(each.name for each in fields(RunOptions))
-    message = re.sub(rf"^({names}) is ", lambda found: f"--{found[1].replace('_', '-')} is ", message)
+
+def as_option(message: str) -> str:
+    """Turn a message about arguments of Python into one about the options with these names."""
+    from .options import RUN, options_of
+
+    names = {each.name: f"--{each.name.replace('_', '-')}" for each in options_of(RUN)}
+    message = re.sub(rf"^({'|'.join(names)}) is ", lambda found: f"{names[found[1]]} is ", message)
+    names = {name: option for name, option in names.items() if "_" in name or name in ("unit", "smoothing", "capacity")}
+    for name, option in (names | NAMED).items():
+        message = re.sub(rf"(?<![-\w]){name}(?=,? (which )?is )", option, message)
+        message = re.sub(rf"(?<![-\w]){name}=", f"{option} ", message)
     message = message.replace("take a shorter step, or dt=None, which", "take a shorter --dt, or none, which")
     return re.sub(r", or None$", "", message).replace("it must be None, a", "it must be a")
-
-
-@contextmanager
-def as_options(names: Mapping[str, str]) -> Iterator[None]:
-    """Replace names of Python's arguments by those of options, anywhere in errors and warnings."""
-
-    def named(text: str) -> str:
-        for name, option in names.items():
-            text = re.sub(rf"(?<![-\w]){name}(?=,? (which )?is )", option, text)
-            text = re.sub(rf"(?<![-\w]){name}=", f"{option} ", text)
-        return text
-
-    with warnings.catch_warnings(record=True) as said:
-        warnings.simplefilter("always")
-        try:
-            yield
-        except InputError as error:
-            raise InputError(named(str(error))) from None
-    for warning in said:
-        warnings.warn(named(str(warning.message)), warning.category, stacklevel=3)
 
 
 def early_end(error: BaseException, done: Recording) -> int:
@@ -233,7 +222,7 @@ def tell_compiling(device: wp.Device) -> None:
 
 def begin_compiling(device: str | None) -> None:
     """Begin to load what all runs launch, while Python imports the rest; that a device is not there is said later."""
-    from warp_corot.inputs.device import checked_device
+    from warp_corot.inputs.checks import checked_device
     from warp_corot.inputs.loading import BODY, begin_loading
 
     _listen()
@@ -270,3 +259,38 @@ def _heard(event: str, args: tuple[Any, ...]) -> None:
         device, _device = _device, ""
         if device:
             complain(f"compiling kernels for {device}, once: this takes some seconds ...", kind="")
+
+
+#: Time for rank 0 to reach the place where another rank failed, and to report it [s].
+REPORTED_WITHIN = 5.0
+
+
+def are_several() -> bool:
+    """Whether ``mpirun`` has started several processes."""
+    return process_count() > 1
+
+
+def speaks() -> bool:
+    """Whether this process prints: the only one, or the first of several."""
+    return process_number() == 0
+
+
+def fall_silent() -> None:
+    """Print nothing from here on: rank 0 prints for all ranks."""
+    null = open(os.devnull, "w")  # noqa: SIM115 (open as long as the process lives)
+    sys.stdout = sys.stderr = null
+
+
+def end_others(status: int) -> None:
+    """On rank 0 of several, after a report: end this process with a status at once, and so all others. MPI's own end
+    would wait for them, and they wait for this report."""
+    if are_several():
+        for stream in (sys.stdout, sys.stderr):
+            with suppress(OSError, ValueError):
+                stream.flush()
+        os._exit(status)
+
+
+def let_others_speak() -> None:
+    """Wait before a failed rank ends, because ``mpirun`` then ends all others: rank 0 first reports the error."""
+    time.sleep(REPORTED_WITHIN)

@@ -35,7 +35,7 @@ def run(args: argparse.Namespace) -> int:
         InputError: There is no such case or device, or the file cannot be written; nothing was run.
     """
     from warp_corot.experiments import CASES, Setup, run_case
-    from warp_corot.inputs.device import checked_device
+    from warp_corot.inputs.checks import checked_device
     from warp_corot.simulation.progress import hidden
 
     from .terminal import tell_compiling

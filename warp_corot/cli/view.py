@@ -21,7 +21,7 @@ from warp_corot.materials.isotropic import Isotropic
 from .patches import press_patches, ramp_of
 from .run_file import bodies_of, write_run
 from .run_setup import RunSetup, set_up
-from .summary import names_of
+from .simulate import names_of
 from .terminal import interrupt_status
 
 if TYPE_CHECKING:

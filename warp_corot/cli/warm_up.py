@@ -10,7 +10,7 @@ from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from warp_corot.inputs.device import checked_device
+from warp_corot.inputs.checks import checked_device
 
 from . import make_parser, simulate
 from .options import CHOICES

@@ -28,7 +28,7 @@ from warp_corot.inputs.checks import check_float32
 from warp_corot.inputs.cpu_threads import Team, team_of
 from warp_corot.kernels.corotated.anisotropic import OrthotropicMaterial, vec9
 from warp_corot.kernels.elements.elements import ForestElements
-from warp_corot.materials.directional import Directional
+from warp_corot.materials.anisotropic import Directional
 from warp_corot.materials.isotropic import Material
 from warp_corot.mesh import TetForest
 

@@ -18,8 +18,7 @@ import warp as wp
 
 from warp_corot.discretization.groups import group_numbers
 from warp_corot.errors import InputError
-from warp_corot.inputs.checks import checked_number, shown
-from warp_corot.inputs.device import checked_device
+from warp_corot.inputs.checks import checked_device, checked_number, shown
 from warp_corot.mesh import TetForest
 from warp_corot.mesh.growing.fine_classification import Resolved
 from warp_corot.mesh.growing.from_domain import checked_wishes, empty_error, filled_tree

@@ -24,8 +24,7 @@ from warp_corot.cutting.blade import Blade
 from warp_corot.elasticity import Corotated, ForceField, Linear, Model, NeoHookean, StVenantKirchhoff
 from warp_corot.elasticity.dilatation import ELEMENT, SHARED, shares_dilatation
 from warp_corot.errors import InputError
-from warp_corot.inputs.checks import checked_count
-from warp_corot.inputs.device import checked_device
+from warp_corot.inputs.checks import checked_count, checked_device
 from warp_corot.mesh import TetForest
 from warp_corot.mesh.uniform import SUBTREE_DEPTH
 from warp_corot.remesh.remeshing import OnlineRemesh, Remeshing

@@ -129,8 +129,8 @@ class Domain(SignedFunction):
         are outside; more than two voxels outside the body's box, phi is a lower bound of the distance.
 
         Args:
-            volume: Whole numbers [nx, ny, nz], the result of `load_volume`, or a file: .nii, .nii.gz, .mgz (nibabel),
-                .mha, .mhd, .nrrd (SimpleITK), .vti (VTK), or a folder with a DICOM series. Positions are the file's
+            volume: Whole numbers [nx, ny, nz], the result of `load_volume`, or a file: .nii, .nii.gz, .mha, .mhd,
+                .nrrd (SimpleITK), .vti (VTK), or a folder with a DICOM series. Positions are the file's
                 own, with axes right-anterior-superior if the format names directions.
             spacing: Distance of voxel centres along the three axes, in ``unit``; needed for an array.
             origin: Position of the centre of voxel (0, 0, 0), in ``unit``; None: the origin.

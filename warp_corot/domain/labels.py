@@ -19,7 +19,7 @@ from warp_corot.domain.units import length, metres_per_unit, unlikely_size, volu
 from warp_corot.errors import InputError
 from warp_corot.inputs.checks import checked_number, checked_numbers, shown
 from warp_corot.inputs.cpu_threads import launch_side_by_side
-from warp_corot.io.read.volumes import LoadedVolume, affine_of, load_volume
+from warp_corot.io.read.filemesh import LoadedVolume, affine_of, load_volume
 from warp_corot.kernels.meshing import domain as kernels
 from warp_corot.kernels.meshing import voxel_distances as distances
 

@@ -10,8 +10,14 @@ import numpy.typing as npt
 import warp as wp
 
 from warp_corot.errors import InputError
-from warp_corot.inputs.checks import checked_axis, checked_length, checked_numbers, checked_strings, shown
-from warp_corot.inputs.device import checked_device
+from warp_corot.inputs.checks import (
+    checked_axis,
+    checked_device,
+    checked_length,
+    checked_numbers,
+    checked_strings,
+    shown,
+)
 from warp_corot.kernels.meshing import domain as kernels
 
 from .units import check_float32, length

@@ -19,7 +19,7 @@ from warp_corot.domain.units import length, metres_per_unit, unlikely_size, volu
 from warp_corot.errors import InputError
 from warp_corot.inputs.cpu_threads import launch_side_by_side
 from warp_corot.inputs.loading import SURFACES, load
-from warp_corot.io.read.surfaces import UP_AXES, LoadedSurface, load_surface
+from warp_corot.io.read.meshes import UP_AXES, LoadedMesh, load_surface
 from warp_corot.kernels.meshing import domain as kernels
 from warp_corot.kernels.meshing import windings
 from warp_corot.mesh.topology import linked
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from warp_corot.domain.closing import ClosedSurface
 
 #: A file, the result of ``load_surface``, or points and triangles.
-Surface = str | PathLike[str] | LoadedSurface | tuple[npt.ArrayLike, npt.ArrayLike]
+Surface = str | PathLike[str] | LoadedMesh | tuple[npt.ArrayLike, npt.ArrayLike]
 
 #: Points along each side of the box at which winding numbers are evaluated.
 SAMPLES = 16
@@ -237,12 +237,12 @@ def _given(
     surface: Surface, unit: str | float | None, up_axis: str | None
 ) -> tuple[Any, Any, float, str, str, list[str]]:
     """Points, triangles, metres per unit, up axis, the file's name for messages, and notes."""
-    if not isinstance(surface, str | PathLike | LoadedSurface):
+    if not isinstance(surface, str | PathLike | LoadedMesh):
         if not isinstance(surface, tuple | list) or len(surface) != 2:
             raise InputError(f"the surface is a {type(surface).__name__}; it must be a file or (points, triangles)")
         unit = "m" if unit is None else unit
         return *surface, metres_per_unit(unit), "Y" if up_axis is None else up_axis, "", [f"unit {unit}"]
-    loaded = surface if isinstance(surface, LoadedSurface) else load_surface(surface)
+    loaded = surface if isinstance(surface, LoadedMesh) else load_surface(surface)
     notes = list(loaded.notes)
     metres = (loaded.metres or 1.0) if unit is None else metres_per_unit(unit)
     if loaded.metres is not None and np.isclose(loaded.metres, metres):
@@ -255,7 +255,7 @@ def _given(
     axis = up_axis or loaded.up_axis or UP_AXES.get(loaded.source.suffix.lower(), "Z")
     if not (up_axis or loaded.up_axis):
         notes.append(f"{axis} taken as up: the file names no up axis")
-    return loaded.points, loaded.triangles, metres, axis, f"{loaded.source}: ", notes
+    return loaded.points, loaded.cells, metres, axis, f"{loaded.source}: ", notes
 
 
 def joined_parts(closed: ClosedSurface, device: wp.Device) -> tuple[int, np.ndarray, bool]:

@@ -182,3 +182,11 @@ def unlikely_size(size: float, metres: float) -> str | None:
         f"the body is {length(size)} long: if its coordinates are in {likely}, give unit={likely!r} "
         f"(a factor of {factor:g}: {length(becomes)})"
     )
+
+
+def pressure(pascals: float) -> str:
+    """A pressure in Pa, kPa, MPa or GPa."""
+    for unit, factor in (("GPa", 1e9), ("MPa", 1e6), ("kPa", 1e3)):
+        if pascals >= factor:
+            return f"{pascals / factor:g} {unit}"
+    return f"{pascals:g} Pa"

@@ -16,13 +16,14 @@ from warp_corot.discretization.discretization import Discretization, discretizat
 from warp_corot.discretization.plan import Plan
 from warp_corot.elasticity.corotated.model import Corotated
 from warp_corot.elasticity.cpu import ByElements
-from warp_corot.elasticity.model import ElementMaterial, ElementTangent, ForceField, Model, SmallForces, Tangent
+from warp_corot.elasticity.model import ElementMaterial, ForceField, Model, SmallForces
+from warp_corot.elasticity.tangents import ElementTangent, SumTangent, Tangent
 from warp_corot.errors import InputError
 from warp_corot.inputs.arguments import forwards
 from warp_corot.inputs.checks import checked_number, checked_numbers, shown
 from warp_corot.kernels.elements import added as kernels
 from warp_corot.kernels.elements.added import ViscousMaterial, relax_simd8, viscosity_stress
-from warp_corot.kernels.elements.forces import element_energies
+from warp_corot.kernels.elements.forces import element_energies, element_law
 from warp_corot.kernels.elements.simd8 import LANES, PRESTRESS, PRONY, VISCOUS, NativeLaw
 
 if TYPE_CHECKING:
@@ -41,9 +42,7 @@ class AddedStressField(ForceField):
         discretization: The mesh and the material.
         law: The elastic law's field.
         Material: The struct that the other stress reads.
-        stress, differential, density: The other stress, its differential, and its energy density, as
-            ``kernels.elements.forces`` and ``kernels.elements.forces`` take them.
-        lanes: The other stress in C++, for the CPU, if it is there.
+        added: The other stress.
 
     Attributes:
         law: The same.
@@ -56,17 +55,14 @@ class AddedStressField(ForceField):
         discretization: Discretization,
         law: ForceField,
         Material: type,
-        stress: wp.Function,
-        differential: wp.Function,
-        density: wp.Function,
-        lanes: NativeLaw | None = None,
+        added: NativeLaw,
     ):
         self.law = law
         super().__init__(discretization, law.deterministic)
-        kind = discretization.element_kind
-        self._forces = ByElements(discretization, self.plan, Material, stress, lanes, slotted=self.deterministic)
-        self._energies = element_energies(kind, Material, density, adds=True)
-        self._own_law = differential, lambda: self.material, Material
+        kind, own = discretization.element_kind, element_law(added.code, Material)
+        self._forces = ByElements(discretization, self.plan, Material, own.stress, added, slotted=self.deterministic)
+        self._energies = element_energies(kind, Material, own.density, adds=True)
+        self._own_law = own.differential, lambda: self.material, Material
 
     @property
     @abstractmethod
@@ -134,40 +130,6 @@ class Stiffest:
         """Add the forces [N] of displacements u to f; both vec4 [worlds * N]."""
         self._field.law.stiffest.add_forces(u, f)
         self._field.add_own_forces(u, f)
-
-
-class SumTangent(Tangent):
-    """The sum of two stiffnesses.
-
-    Args:
-        first, second: The two.
-    """
-
-    def __init__(self, first: Tangent, second: Tangent):
-        super().__init__(second.field)
-        self._both = first, second
-
-    @property
-    def kernels(self) -> list[wp.Kernel]:
-        return [kernel for each in self._both for kernel in each.kernels]
-
-    def prepare(self, u: wp.array) -> None:
-        super().prepare(u)
-        for each in self._both:
-            each.prepare(u)
-
-    def take(self, u: wp.array) -> None:
-        super().take(u)
-        for each in self._both:
-            each.take(u)
-
-    def add_product(self, p: wp.array, y: wp.array) -> None:
-        for each in self._both:
-            each.add_product(p, y)
-
-    def add_diagonal(self, blocks: wp.array) -> None:
-        for each in self._both:
-            each.add_diagonal(blocks)
 
 
 # --- viscoelastic tissue: a Prony series of Maxwell elements ---------------------------------------------------------
@@ -246,8 +208,7 @@ class PronyField(AddedStressField):
     """
 
     def __init__(self, discretization: Discretization, model: Prony, law: ForceField):
-        functions = (kernels.prony_stress, kernels.prony_differential, kernels.prony_density)
-        super().__init__(discretization, law, kernels.PronyMaterial, *functions, lanes=PRONY)
+        super().__init__(discretization, law, kernels.PronyMaterial, PRONY)
         g, tau = (np.array(values, np.float32) for values in model.terms)
         self._carried, counts = model.carried, self.plan.counts
         #: The number of elements may grow if the mesh changes.
@@ -369,8 +330,7 @@ class PrestressedField(AddedStressField):
     """
 
     def __init__(self, discretization: Discretization, model: Prestressed, law: ForceField):
-        functions = (kernels.prestress_stress, kernels.prestress_differential, kernels.prestress_density)
-        super().__init__(discretization, law, kernels.Prestress, *functions, lanes=PRESTRESS)
+        super().__init__(discretization, law, kernels.Prestress, PRESTRESS)
         stress, count = np.array(model.stress), len(discretization.mesh.tets)
         if stress.ndim == 3 and len(stress) != count:
             raise InputError(f"stress has {len(stress)} tensors; the mesh has {count} elements")

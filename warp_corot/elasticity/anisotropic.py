@@ -19,13 +19,16 @@ from warp_corot.errors import InputError
 from warp_corot.inputs.loading import LoadedKernel
 from warp_corot.kernels.clusters.laws import ActiveMaterial, anisotropic_law, reinforced_law
 from warp_corot.kernels.corotated.anisotropic import (
+    REINFORCED,
     FibreMaterial,
     OrthotropicMaterial,
+    ReinforcedMaterial,
     active_density,
-    anisotropic_differential,
     fibre_cauchy,
     fibre_density,
+    fibre_differential,
     fibre_stress,
+    reinforced_cauchy,
     scatter_anisotropic_simd8,
     turn_changed,
     turn_elements,
@@ -33,13 +36,6 @@ from warp_corot.kernels.corotated.anisotropic import (
 from warp_corot.kernels.corotated.well_conditioned import quaternions_of
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial
 from warp_corot.kernels.elements.dilatation import LOG_VOLUME
-from warp_corot.kernels.elements.fibres import (
-    ReinforcedMaterial,
-    reinforced_cauchy,
-    reinforced_density,
-    reinforced_differential,
-    reinforced_stress,
-)
 from warp_corot.kernels.elements.forces import element_energies, repair_forces
 from warp_corot.kernels.elements.simd8 import FIBRES
 from warp_corot.kernels.math.rotation import byers_xu, quick_rotation
@@ -47,8 +43,7 @@ from warp_corot.kernels.subtrees.anisotropic import repair_leaves, scatter_aniso
 from warp_corot.kernels.subtrees.degenerate import NO_LIST
 from warp_corot.kernels.subtrees.memory import BLOCK
 from warp_corot.kernels.tables.cluster_layout import ANISOTROPIC
-from warp_corot.materials.anisotropic import TransverselyIsotropic
-from warp_corot.materials.reinforced import FibreReinforced
+from warp_corot.materials.anisotropic import FibreReinforced, TransverselyIsotropic
 
 if TYPE_CHECKING:
     from warp_corot.discretization.discretization import Discretized
@@ -115,7 +110,7 @@ class AnisotropicField(FibreField):
         super().__init__(
             discretization,
             stress=fibre_stress(rotation),
-            differential=anisotropic_differential(rotation),
+            differential=fibre_differential(rotation),
             density=fibre_density(rotation),
             cauchy=fibre_cauchy(rotation),
             Material=FibreMaterial,
@@ -283,15 +278,15 @@ class ReinforcedField(FibreField):
     def __init__(self, discretization: Discretization, deterministic: bool):
         super().__init__(
             discretization,
-            stress=reinforced_stress,
-            differential=reinforced_differential,
-            density=reinforced_density,
+            stress=REINFORCED.stress,
+            differential=REINFORCED.differential,
+            density=REINFORCED.density,
             cauchy=reinforced_cauchy,
             Material=ReinforcedMaterial,
             deterministic=deterministic,
         )
         _, self._clusters = divided(discretization, self.plan, reinforced_law, ReinforcedMaterial)
-        self._by_elements = ByElements(discretization, self.plan, ReinforcedMaterial, reinforced_stress, FIBRES)
+        self._by_elements = ByElements(discretization, self.plan, ReinforcedMaterial, REINFORCED.stress, FIBRES)
         self._made = Kept(_material)
 
     def plan_of(self, discretization: Discretization) -> Plan:

@@ -24,10 +24,10 @@ from warp_corot.inputs.loading import LoadedKernel
 from warp_corot.kernels.clusters.laws import ActiveMaterial
 from warp_corot.kernels.clusters.pairs import GeneralPairs, LatticePairs, scatter_pairs
 from warp_corot.kernels.clusters.single import AlignedElements, align_elements, scatter_clusters
+from warp_corot.kernels.corotated.anisotropic import ReinforcedMaterial
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial
 from warp_corot.kernels.elements.cpu import rest_matrices
 from warp_corot.kernels.elements.elements import ForestElements, GeneralElements
-from warp_corot.kernels.elements.fibres import ReinforcedMaterial
 from warp_corot.kernels.tables.cluster_layout import (
     AHEAD,
     DEFAULT_LAYOUT,

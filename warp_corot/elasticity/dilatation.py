@@ -15,7 +15,8 @@ from warp_corot.discretization.groups import Members
 from warp_corot.discretization.plan import Batch, Plan
 from warp_corot.elasticity.cpu import Dilating
 from warp_corot.elasticity.groups import ClusteredGroups, ElementGroups, elements_of, group_numbers
-from warp_corot.elasticity.model import ElementTangent, ForceField, SmallForces, Tangent
+from warp_corot.elasticity.model import ForceField, SmallForces
+from warp_corot.elasticity.tangents import ElementTangent, Tangent
 from warp_corot.errors import InputError
 from warp_corot.inputs.arguments import forwards
 from warp_corot.inputs.checks import checked_choice, shown
@@ -23,7 +24,7 @@ from warp_corot.inputs.choices import AUTO, ELEMENT, SHARED
 from warp_corot.inputs.loading import LoadedKernel, load
 from warp_corot.kernels.elements import dilatation as kernels
 from warp_corot.kernels.elements import mean_dilatation_rows as rows
-from warp_corot.kernels.elements.dilatation import SMALL, VOLUME, Dilatation, DilatedMaterial, not_held
+from warp_corot.kernels.elements.dilatation import SMALL, VOLUME, Dilatation, DilatedMaterial
 from warp_corot.kernels.elements.simd8 import LANES, STRESSLESS
 from warp_corot.kernels.subtrees import cpu as subtree_cpu
 from warp_corot.kernels.subtrees import cuda as subtree_cuda
@@ -53,7 +54,7 @@ class SharedTangent(Tangent):
         self._turns = (exact or field.of is not VOLUME) and field.of is not SMALL
         own = kernels.own_differential(field.of), self._material, DilatedMaterial
         self._of_elements = ElementTangent(field, *own)
-        self._holds = field.of.holding is not not_held
+        self._holds = field.of.is_held
         self._version = -1
         self._shared = wp.zeros(0, dtype=wp.vec4, device=field.device)
 

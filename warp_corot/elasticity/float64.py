@@ -44,7 +44,7 @@ def stresses(law: IsotropicLaw, a: Array, mu: npt.ArrayLike, lam: npt.ArrayLike,
         law: The law.
         a: F - I, [T, 3, 3].
         mu, lam: Lamé's parameters [Pa], numbers or [T].
-        da: Directions of the differential, [T, 3, 3]; None: zero. Ogden's law has no differential.
+        da: Directions of the differential, [T, 3, 3]; None: zero.
     """
     count = len(a)
     lame = (np.broadcast_to(np.asarray(values, np.float64), count) for values in (mu, lam))
@@ -106,8 +106,7 @@ def cauchy_stress(model: Model, a: Array, young: npt.ArrayLike, poisson: npt.Arr
     """Cauchy stress [Pa], [T, 3, 3]; `Simulation.von_mises` is its equivalent stress.
 
     For Corotated it is the stress of the law, R (2 mu e + lambda tr(e) I) R^T with e = sym(R^T F) - I, zero in elements
-    without a definite rotation; for Linear it is that of small strains. Both are without the factor 1 / J. Ogden's has
-    seven digits.
+    without a definite rotation; for Linear it is that of small strains. Both are without the factor 1 / J.
 
     Args:
         model: The elastic law; see `has_tensor`.

@@ -46,7 +46,7 @@ class ElementGroups:
             if not plan.kinds:
                 raise InputError(
                     "this model computes forces leaf by leaf, where elements of a body that is remeshed cannot share "
-                    "their dilatation; take dilatation='element', or the model's default rotations and stiffness"
+                    "their dilatation; take dilatation='element', or the model's default rotations"
                 )
             self._found = ChangingGroups(plan)
             self.live = self._found.live

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import warp as wp
@@ -20,8 +20,8 @@ from warp_corot.errors import InputError
 from warp_corot.inputs.checks import checked_number, shown
 from warp_corot.inputs.loading import LoadedKernel, load
 from warp_corot.kernels.clusters.laws import isotropic_law
-from warp_corot.kernels.elements import ogden as kernels
 from warp_corot.kernels.elements.constitutive import (
+    law_functions,
     linear_differential,
     linear_energy,
     linear_stress,
@@ -33,6 +33,7 @@ from warp_corot.kernels.elements.constitutive import (
     stvk_stress,
 )
 from warp_corot.kernels.elements.dilatation import GREEN, LOG_VOLUME, SMALL, Dilatation
+from warp_corot.kernels.elements.simd8 import IsotropicLaw, bare, stretch_limits
 from warp_corot.kernels.subtrees import cuda as subtree_cuda
 from warp_corot.kernels.subtrees.degenerate import NO_LIST
 from warp_corot.kernels.subtrees.memory import BLOCK
@@ -115,6 +116,12 @@ class LawSimdField(LawField):
 
 
 # --- the choice of kernels -------------------------------------------------------------------------------------------
+
+
+@cache
+def law_of(terms: IsotropicLaw) -> Law:
+    """Ogden's law of some terms."""
+    return Law(*law_functions(bare(terms).code), terms)
 
 
 def law_field(law: Law, discretization: Discretization, deterministic: bool = False) -> LawField:
@@ -283,12 +290,11 @@ class Ogden(Model):
     @property
     def stretch_limits(self) -> tuple[float, float]:
         """Smallest and largest principal stretch at which every term is the plain law."""
-        low, high = zip(*(kernels.stretch_limits(alpha) for _share, alpha in self.terms), strict=True)
+        low, high = zip(*(stretch_limits(alpha) for _share, alpha in self.terms), strict=True)
         return max(low), min(high)
 
     def bind(self, body: Discretized | Discretization, *, deterministic: bool = False) -> ForceField:
-        law = Law(**kernels.ogden(self.terms), lanes=self.terms)
-        return bind_law(partial(law_field, law), LOG_VOLUME, self.dilatation, body, deterministic)
+        return bind_law(partial(law_field, law_of(self.terms)), LOG_VOLUME, self.dilatation, body, deterministic)
 
 
 def _numbers(given: Any, name: str) -> tuple[float, ...]:

@@ -16,18 +16,16 @@ from warp_corot.discretization.discretization import Discretization, Discretized
 from warp_corot.discretization.groups import Members
 from warp_corot.discretization.plan import Batch, FlatLeaves, Plan, chosen
 from warp_corot.elasticity.divided import DividedForces, Piece
+from warp_corot.elasticity.tangents import ElementTangent, Tangent
 from warp_corot.errors import InputError
 from warp_corot.inputs.cpu_threads import Regions, Team, launch
 from warp_corot.inputs.loading import LoadedKernel, load
-from warp_corot.kernels.corotated.anisotropic import FibreMaterial
+from warp_corot.kernels.corotated.anisotropic import FibreMaterial, ReinforcedMaterial
 from warp_corot.kernels.corotated.tangent import KeptStrains
 from warp_corot.kernels.elements.added import Prestress, PronyMaterial
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial, RotatedMaterial
 from warp_corot.kernels.elements.dilatation import DilatedMaterial
-from warp_corot.kernels.elements.fibres import ReinforcedMaterial
 from warp_corot.kernels.elements.forces import (
-    add_stiffness_diagonal,
-    add_stiffness_product,
     element_energies,
     element_von_mises,
     law_cauchy,
@@ -572,73 +570,3 @@ class LawField(ElementField):
             cauchy=law_cauchy(law.stress) if law.cauchy is None else law_value(law.cauchy),
             deterministic=deterministic,
         )
-
-
-# --- The stiffness of a force field at stored displacements, for the many products of an iterative solver ---
-
-
-class Tangent(ABC):
-    """K(u) of a force field, with the same u from one ``take`` to the next.
-
-    Args:
-        field: The field.
-
-    Attributes:
-        displacements: u [m], vec4, with the length of the first one; ``take`` fills it.
-    """
-
-    def __init__(self, field: ForceField):
-        self.field = field
-        self.displacements = wp.zeros(0, dtype=wp.vec4, device=field.device)
-
-    @property
-    def kernels(self) -> list[wp.Kernel]:
-        """Kernels of factories that products launch; each that is named is loaded beside others."""
-        return []
-
-    def prepare(self, u: wp.array) -> None:
-        """Allocate memory for displacements like these; not while launches are recorded."""
-        if len(self.displacements) != len(u):
-            self.displacements = wp.zeros_like(u)
-
-    def take(self, u: wp.array) -> None:
-        """Launch the update of K to displacements u."""
-        wp.copy(self.displacements, u)
-
-    @abstractmethod
-    def add_product(self, p: wp.array, y: wp.array) -> None:
-        """Launch y += K p [N]; both vec4 [worlds * N]."""
-
-    @abstractmethod
-    def add_diagonal(self, blocks: wp.array) -> None:
-        """Launch the addition of the 3x3 blocks on K's diagonal to those of the nodes [N/m], mat33 [worlds * N]."""
-
-
-class ElementTangent(Tangent):
-    """K of a law, element by element on every path of forces; see ``kernels.elements.forces``.
-
-    Args:
-        field: The field.
-        differential: Device function (elements, t, material, u, dg) -> dP.
-        material: Gives the struct that it reads.
-        Material: The type of the struct.
-    """
-
-    def __init__(
-        self,
-        field: ForceField,
-        differential: wp.Function,
-        material: Callable[[], ElementMaterial],
-        Material: type = IsotropicMaterial,
-    ):
-        super().__init__(field)
-        self._material = material
-        self._generated_from = field.discretization.element_kind, Material, differential
-
-    def add_product(self, p: wp.array, y: wp.array) -> None:
-        inputs = [self.field.elements, self._material(), self.displacements, p]
-        self.field.launch(add_stiffness_product(*self._generated_from), self.field.element_count, inputs, [y])
-
-    def add_diagonal(self, blocks: wp.array) -> None:
-        inputs = [self.field.elements, self._material(), self.displacements]
-        self.field.launch(add_stiffness_diagonal(*self._generated_from), 4 * self.field.element_count, inputs, [blocks])

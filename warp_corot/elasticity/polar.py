@@ -9,10 +9,8 @@ import numpy.typing as npt
 import warp as wp
 
 from warp_corot.errors import InputError
-from warp_corot.inputs.checks import checked_choice, checked_count, checked_numbers
-from warp_corot.inputs.device import checked_device
-from warp_corot.kernels.math.polar import rotate_all
-from warp_corot.kernels.math.rotation import byers_xu, byers_xu_fixed, mcadams_svd
+from warp_corot.inputs.checks import checked_choice, checked_count, checked_device, checked_numbers
+from warp_corot.kernels.math.rotation import byers_xu, byers_xu_fixed, mcadams_svd, rotate_all
 
 METHODS = ("byers-xu", "svd")
 MAX_ITERATIONS = 12

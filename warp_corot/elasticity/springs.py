@@ -12,7 +12,8 @@ from warp_corot.discretization.elements import in_worlds, repeated
 from warp_corot.discretization.plan import Plan, Slots
 from warp_corot.elasticity.dilatation import ELEMENT, refuse_shared
 from warp_corot.elasticity.laws import StVenantKirchhoff
-from warp_corot.elasticity.model import ElementField, ForceField, Model, StressLaw, Tangent, isotropic_material
+from warp_corot.elasticity.model import ElementField, ForceField, Model, StressLaw, isotropic_material
+from warp_corot.elasticity.tangents import Tangent
 from warp_corot.inputs.checks import checked_choice
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial, stvk_stress
 from warp_corot.kernels.elements.forces import element_von_mises, law_cauchy

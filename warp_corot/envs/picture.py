@@ -12,7 +12,7 @@ from warp_corot.contact.tool import Obstacle
 from warp_corot.errors import InputError
 from warp_corot.io.pictures.colors import VertexAverage
 from warp_corot.io.pictures.drawing import Camera, Window, render
-from warp_corot.io.write.solids import poses_of, shape_of, solid_of
+from warp_corot.io.write.skins import poses_of, shape_of, solid_of
 
 if TYPE_CHECKING:
     from .soft_env import SoftEnv

@@ -26,8 +26,7 @@ from warp_corot.contact.options import Contact
 from warp_corot.discretization.discretization import centroids
 from warp_corot.elasticity import Corotated
 from warp_corot.errors import InputError, UnstableError
-from warp_corot.inputs.checks import checked_choice, checked_count, checked_flag, checked_numbers, shown
-from warp_corot.inputs.device import checked_device
+from warp_corot.inputs.checks import checked_choice, checked_count, checked_device, checked_flag, checked_numbers, shown
 from warp_corot.kernels.envs import episodes as kernels
 from warp_corot.materials.isotropic import Isotropic
 from warp_corot.simulation.simulation import Simulation

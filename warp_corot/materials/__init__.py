@@ -1,7 +1,6 @@
 """Materials, from which every elastic model takes its constants."""
 
-from .anisotropic import Orthotropic, TransverselyIsotropic
+from .anisotropic import FibreReinforced, Orthotropic, TransverselyIsotropic
 from .isotropic import Isotropic
-from .reinforced import FibreReinforced
 
 __all__ = ["FibreReinforced", "Isotropic", "Orthotropic", "TransverselyIsotropic"]

@@ -145,14 +145,14 @@ class TetMesh(LabelledMesh):
             InputError: The file does not exist, its format is unknown, it has no volume cells, or its mesh cannot be
                 simulated.
         """
-        from warp_corot.io.read.tetrahedra import load_tets
+        from warp_corot.io.read.meshes import load_tets
 
         loaded = load_tets(path, scale=scale, unit=unit, regions=regions)
         found = loaded.regions
         return cls(
             loaded.points,
-            loaded.tets,
-            up_axis=up_axis or loaded.up_axis,
+            loaded.cells,
+            up_axis=up_axis or loaded.up_axis or "Z",
             labels=None if found is None else found.of_tet,
             label_names=() if found is None else found.names,
             node_sets=loaded.node_sets,

@@ -1,21 +1,407 @@
-"""What a browser asks for: each command is checked, and done on the session's thread."""
+"""What the browser is told, what it asks for, and what it saves; commands are done on the session's thread."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import io
+import tempfile
+from collections.abc import Callable, Collection, Iterator, Sequence
+from dataclasses import asdict, replace
 from functools import partial
-from typing import Any
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-from warp_corot.errors import InputError
+import numpy as np
+
+from warp_corot.contact.shapes import Ground
+from warp_corot.contact.tool import Tool
+from warp_corot.elasticity import MODELS, Corotated, EdgeStVK, MassSpring, Model, Prestressed, Prony
+from warp_corot.elasticity.dilatation import AUTO
+from warp_corot.errors import InputError, UnstableError
 from warp_corot.inputs.checks import checked_choice, checked_count, checked_flag, checked_number, checked_vector, shown
+from warp_corot.io.pictures.colors import STEEL, TISSUE, stress_colors
+from warp_corot.io.pictures.preview import write_film
+from warp_corot.io.write.animate import frame_count, record
+from warp_corot.io.write.skins import Solid, solid_of
+from warp_corot.materials.isotropic import Isotropic
+from warp_corot.mesh import TetForest
 from warp_corot.remesh.remeshing import OnlineRemesh
+from warp_corot.simulation.simulation import Simulation
 
-from .hands import HANDS
-from .saving import Saving
-from .server import Visitor
-from .session import Session
-from .shown import Plane
-from .tissue import choices, collapses, present, switched
+from .hands import HANDS, ToolHand
+from .server import Visitor, packed
+from .session import PageFrame, Session
+from .shown import INPUT, Plane
+
+if TYPE_CHECKING:
+    from PIL.Image import Image
+
+#: Pixels of films and pictures.
+WIDTH, HEIGHT = 1280, 720
+#: How long a browser may take to draw a picture [s].
+PATIENCE = 20.0
+#: Frames per second of films and animations.
+FPS = 24.0
+
+
+class Cancelled(Exception):
+    """The visitor cancelled."""
+
+
+class Saving:
+    """Saves what visitors ask for; called on the session's thread.
+
+    Args:
+        session: The session that is saved.
+        show: Sends the present frame to all visitors.
+        run_file: The run file of the simulation, or None.
+
+    Attributes:
+        kinds: What can be saved.
+    """
+
+    def __init__(
+        self, session: Session, show: Callable[[], None], run_file: Callable[[Simulation], bytes] | None = None
+    ):
+        self._session, self._show, self._is_cancelled = session, show, False
+        self.kinds: dict[str, Callable[[Visitor, float], str | None]] = {
+            "picture": self._picture,
+            "film": self._film,
+            "animation": self._animation,
+            "checkpoint": self._checkpoint,
+        }
+        if run_file is not None:
+            text = run_file
+            self.kinds["run file"] = lambda who, _: _send(who, "run.toml", text(session.sim))
+
+    def save(self, visitor: Visitor, kind: str, seconds: float) -> None:
+        """Save something for a visitor.
+
+        Args:
+            kind: One of ``kinds``.
+            seconds: The simulated duration of a film or an animation [s].
+
+        Raises:
+            InputError: Something is being saved.
+        """
+        session = self._session
+        if session.busy:
+            raise InputError("something is being saved; it must end first")
+        session.busy, self._is_cancelled = True, False
+        try:
+            session.note = self.kinds[kind](visitor, seconds) or ""
+        except (OSError, RuntimeError) as error:  # a browser that has gone, a full disk
+            session.note = f"nothing was saved: {error}"
+        finally:
+            session.busy = False
+            session.pace.interrupted()
+
+    def end_early(self) -> None:
+        """End a film or an animation after the present frame; what there is of it is kept."""
+        self._is_cancelled = True
+
+    # --- pictures --------------------------------------------------------------------------------------------------
+
+    def _picture(self, visitor: Visitor, _: float) -> None:
+        found = io.BytesIO()
+        _drawn(visitor).save(found, format="PNG")
+        _send(visitor, "picture.png", found.getvalue())
+
+    def _film(self, visitor: Visitor, seconds: float) -> None:
+        """Save frames at even intervals of simulated time, however long each one takes."""
+        name = "film.mp4" if find_spec("imageio_ffmpeg") else "film.gif"
+        count = frame_count(seconds, FPS)
+        with tempfile.TemporaryDirectory() as folder:
+            frames = []
+            for number in range(count + 1):
+                if self._is_cancelled:
+                    break
+                if number:
+                    self._session.sim.advance(1.0 / FPS)
+                self._between(number, count)
+                frames.append(Path(folder) / f"{number}.png")
+                _drawn(visitor).save(frames[-1])
+            if frames:
+                write_film(Path(folder) / name, _opened(frames), FPS)
+                _send(visitor, name, (Path(folder) / name).read_bytes())
+
+    # --- files -----------------------------------------------------------------------------------------------------
+
+    def _animation(self, visitor: Visitor, seconds: float) -> str:
+        session, note = self._session, ""
+
+        def progress(number: int, count: int) -> None:
+            self._between(number, count)
+            if self._is_cancelled:
+                raise Cancelled
+
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "animation.usd"
+            try:
+                record(
+                    session.sim,
+                    path,
+                    duration=seconds,
+                    fps=FPS,
+                    world=session.controls.world,
+                    surface=[surfaces.get(INPUT) for surfaces in session.surfaces],
+                    progress=progress,
+                )
+            except (Cancelled, UnstableError) as error:  # the frames before are there
+                note = str(error)
+            _send(visitor, path.name, path.read_bytes())
+        return note
+
+    def _checkpoint(self, visitor: Visitor, _: float) -> None:
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "checkpoint.npz"
+            self._session.sim.save(path)
+            _send(visitor, path.name, path.read_bytes())
+
+    def _between(self, number: int, count: int) -> None:
+        """Continue during a long save: hands move, and the frame is shown."""
+        self._session.take_commands()
+        self._session.note = f"frame {number} of {count}"
+        self._show()
+
+
+def _drawn(visitor: Visitor) -> Image:
+    """The picture that a browser shows, without its panels.
+
+    Raises:
+        OSError, RuntimeError: The browser has left, or does not draw.
+    """
+    from PIL import Image
+
+    with Image.open(io.BytesIO(visitor.drawn(WIDTH, HEIGHT, PATIENCE))) as drawn:
+        return drawn.convert("RGB")
+
+
+def _opened(frames: list[Path]) -> Iterator[Image]:
+    from PIL import Image
+
+    for path in frames:
+        with Image.open(path) as image:
+            yield image.convert("RGB")
+
+
+def _send(visitor: Visitor, name: str, content: bytes) -> None:
+    visitor.send(packed({"kind": "file", "name": name, "size": len(content)}, content))
+
+
+#: Weight over stiffness, density g L / E, from which on a body of length L hardly keeps its shape.
+COLLAPSING = 0.15
+#: The name of the choice that gives every element its own rotation.
+OWN = "own"
+
+
+class Tissue(NamedTuple):
+    """A tissue that a visitor may choose.
+
+    Attributes:
+        name: Its name.
+        young: Young's modulus [Pa].
+        density: [kg/m^3], of Mech. Mater. 44 (2012) 174, table 3.
+        source: The source of Young's modulus.
+        poisson: Poisson's ratio; all are nearly incompressible, and a larger one takes longer.
+    """
+
+    name: str
+    young: float
+    density: float
+    source: str
+    poisson: float = 0.45
+
+
+_ARDA = "Arda et al., AJR 197 (2011) 532: shear waves"
+TISSUES = (
+    Tissue("brain", 1.9e3, 1040.0, "Budday et al., J. Mech. Behav. Biomed. 46 (2015) 318: white matter, indented"),
+    Tissue("fat", 3.25e3, 950.0, "Samani et al., Phys. Med. Biol. 52 (2007) 1565: of the breast, indented"),
+    Tissue("kidney", 5.0e3, 1050.0, f"{_ARDA} in the cortex"),
+    Tissue("liver", 5.5e3, 1060.0, "Roulot et al., J. Hepatol. 48 (2008) 606: transient elastography, 429 people"),
+    Tissue("muscle", 11.1e3, 1050.0, f"{_ARDA} in the gastrocnemius"),
+)
+
+
+def present(sim: Simulation) -> dict[str, Any]:
+    """The present tissue of the first body, by the names of ``switched``."""
+    material, model = sim.bodies[0].material, sim.models[0]
+    mean = material.isotropic
+    return {
+        "law": next(name for name, kind in MODELS.items() if type(model) is kind),
+        "rotations": OWN if (level := getattr(model, "rotation_level", None)) is None else str(level),
+        "young": float(np.mean(mean.young)),
+        "poisson": float(np.mean(mean.poisson)),
+        "density": float(np.mean(material.density)),
+        "remesh": bool(sim.remeshing.every),
+        "weight": any(sim.gravity),
+    }
+
+
+def choices(sim: Simulation) -> dict[str, Any]:
+    """The laws and rotations that can be chosen, and whether Poisson's ratio and remeshing can be."""
+    meshes = [body.mesh for body in sim.bodies]
+    levels = [int(mesh.levels.max()) for mesh in meshes if isinstance(mesh, TetForest)]
+    are_forests = len(levels) == len(meshes)
+    now, names = present(sim), [OWN]
+    if are_forests:
+        names += ["auto", *map(str, range(min(levels)))]
+    return {
+        "laws": [name for name in MODELS if name == now["law"] or name not in ("prestressed", "prony")],
+        "rotations": list(dict.fromkeys([*names, now["rotations"]])),
+        "poisson": all(type(body.material) is Isotropic for body in sim.bodies),
+        "remesh": sim.worlds == 1 and are_forests,
+    }
+
+
+def switched(sim: Simulation, wanted: dict[str, Any], gravity: Sequence[float]) -> dict[str, Any]:
+    """The models, materials and gravity of ``remade`` for a wanted tissue; what stays as it is is left out.
+
+    Args:
+        wanted: Values by the names of ``present``.
+        gravity: Gravity of bodies with weight [m/s^2], [3].
+    """
+    now, found = present(sim), dict[str, Any]()
+    changes = {name for name, value in now.items() if wanted.get(name, value) != value}
+    if changes & {"law", "rotations"}:
+        model = model_of(wanted["law"], wanted["rotations"], sim.models[0])
+        found["models"] = [model] * len(sim.bodies)
+    if "weight" in changes:
+        found["gravity"] = gravity if wanted["weight"] else (0.0, 0.0, 0.0)
+    if changes & {"young", "poisson", "density"}:
+        poisson = wanted["poisson"] if "poisson" in changes else None
+        stiffer, heavier = wanted["young"] / now["young"], wanted["density"] / now["density"]
+        found["materials"] = [changed(body.material, stiffer, poisson, heavier) for body in sim.bodies]
+    return found
+
+
+def collapses(tissue: dict[str, Any], gravity: Sequence[float], size: float) -> bool:
+    """Whether bodies of a size [m] would hardly keep their shape under gravity [m/s^2]."""
+    weight = tissue["density"] * float(np.linalg.norm(gravity)) * size if tissue["weight"] else 0.0
+    return weight > COLLAPSING * tissue["young"]
+
+
+def model_of(law: str, rotations: str, former: Model | None = None) -> Model:
+    """The model that the controls name; only the corotated one shares rotations, and springs share no dilatation.
+
+    Args:
+        former: The present model, whose choice of dilatation is kept.
+    """
+    kind = MODELS[law]
+    if kind in (Prestressed, Prony) and former is not None:
+        return former
+    options: dict[str, Any] = {}
+    springs = (EdgeStVK, MassSpring)
+    if kind not in springs and not isinstance(former, springs):
+        options["dilatation"] = getattr(former, "dilatation", AUTO)
+    if kind is Corotated and rotations != OWN:
+        options["rotation_level"] = _number(rotations)
+    return kind(**options)
+
+
+def changed(material: Any, stiffer: float, poisson: float | None, heavier: float = 1.0) -> Any:
+    """The material with its stiffness and its density times factors and, if it is isotropic and one is given, another
+    Poisson's ratio.
+    """
+    stiff = [name for name in vars(material) if name.startswith(("young", "shear", "k1"))]
+    values = {name: getattr(material, name) * stiffer for name in stiff}
+    values["density"] = material.density * heavier
+    if poisson is not None and type(material) is Isotropic:
+        values["poisson"] = poisson
+    return replace(material, **values)
+
+
+def _number(text: str) -> int | float | str:
+    for kind in (int, float):
+        try:
+            return kind(text)
+        except ValueError:
+            continue
+    return text
+
+
+#: The table of the colours, as one word of hexadecimal digits.
+_COLORS = np.rint(255.0 * stress_colors()).astype(np.uint8).tobytes().hex()
+#: What is drawn of a ground, which the browser draws itself, and of other obstacles that have no surface.
+_NOTHING = Solid(np.zeros((0, 3)), np.zeros((0, 3), np.int32))
+
+
+def page_told(session: Session, title: str, saves: Collection[str]) -> bytes:
+    """The controls, their choices and values, and what the scene is.
+
+    Args:
+        saves: What can be saved.
+    """
+    controls, sim = session.controls, session.sim
+    plane = controls.plane
+    cut = None if plane is None else {**asdict(plane), "axis": "xyz"[plane.axis]}
+    there = [name for name, source in session.sources.items() if any(map(source.applies, sim.bodies))]
+    return packed(
+        {
+            "kind": "page",
+            "title": title,
+            "elements": sum(body.world_element_count for body in sim.bodies),
+            "size": session.size,
+            "up": session.up.tolist(),
+            "colormap": _COLORS,
+            "tissueColor": TISSUE,
+            "toolColor": STEEL,
+            "controls": {**asdict(controls), "plane": cut, "world": str(controls.world)},
+            "tool": session.tool,
+            "sources": {name: [session.sources[name].label, session.sources[name].unit] for name in there},
+            "surfaces": list(dict.fromkeys(name for each in session.surfaces for name in each)),
+            "worlds": sim.worlds,
+            "tissue": present(sim),
+            "choices": {**choices(sim), "weight": any(session.gravity)},
+            "tissues": [each._asdict() for each in TISSUES],
+            "saves": list(saves),
+            "busy": session.busy,
+            "note": session.note,
+        }
+    )
+
+
+def topology(session: Session, frame: PageFrame) -> bytes:
+    """The rest points and the triangles of each body, and the solids of the obstacles that are drawn."""
+    bodies = [(shown.rest, triangles) for shown, triangles in zip(session.shown, frame.triangles, strict=True)]
+    solids = [solid_of(tool.shape) or _NOTHING for tool in session.tools]
+    grounds = [number for number, tool in enumerate(session.tools) if isinstance(tool.shape, Ground)]
+    parts = [*bodies, *((solid.points, solid.triangles) for solid in solids)]
+    header = {
+        "kind": "topology",
+        "bodies": [[len(points), len(triangles)] for points, triangles in bodies],
+        "solids": [[len(solid.points), len(solid.triangles)] for solid in solids],
+        "movable": [isinstance(each, Tool) for each in session.given],
+        "grounds": grounds,
+    }
+    arrays = [np.ascontiguousarray(points, np.float32) for points, _ in parts]
+    arrays += [np.ascontiguousarray(triangles, np.uint32) for _, triangles in parts]
+    return packed(header, *arrays)
+
+
+def frame_told(session: Session, frame: PageFrame) -> bytes:
+    """What changes from frame to frame: 13 bytes a point."""
+    # Tools that nobody drags need no mark.
+    hands = [
+        {"place": frame.ends[owner][0].tolist(), "force": force.tolist(), "dragged": isinstance(owner, int)}
+        for owner, force in frame.forces.items()
+        if isinstance(owner, int) or not isinstance(session.hands[owner], ToolHand)
+    ]
+    source = session.sources.get(session.controls.colors)
+    header = {
+        "kind": "frame",
+        "time": frame.time,
+        "ratio": frame.ratio,
+        "slow": bool(frame.slow),
+        "highest": frame.highest if source is not None else 0.0,
+        "shaded": [shades is not None for shades in frame.shades],
+        "force": float(np.linalg.norm(sum(frame.forces.values(), np.zeros(3)))),
+        "hands": hands,
+        "poses": [pose.tolist() for pose in frame.poses],
+    }
+    shades = [each for each in frame.shades if each is not None]
+    return packed(header, *frame.positions, *shades)
+
 
 Command = Callable[[], None]
 

@@ -23,10 +23,8 @@ from warp_corot.mesh.surfaces.bound import SurfaceMesh
 from warp_corot.simulation.remade import remade, tools_lent
 from warp_corot.simulation.simulation import Simulation
 
-from .colors import Range, Source, sources
-from .hands import HANDS, SpringHand, Springs
-from .shown import Plane, Shown, cut, surfaces_of
-from .tools import ToolHand, new_tool
+from .hands import HANDS, SpringHand, Springs, ToolHand, new_tool
+from .shown import Plane, Range, Shown, Source, cut, sources, surfaces_of
 
 # --- controls in one direction, frames in the other ------------------------------------------------------------------
 
@@ -354,7 +352,7 @@ class Session:
         """Compile what frames, hands and the page's tools launch, several modules at a time."""
         explicit = not self.sim.system.is_implicit
         contact = CONTACT_ON_CPU if explicit and not self.sim.device.is_cuda else ()
-        load(["viewing.values", "viewing.hands", *contact], self.sim.device)
+        load(["viewing.hands", *contact], self.sim.device)
         self.sim.advance_steps(1)
         self.frame()
 

@@ -1,19 +1,24 @@
-"""The surface that is shown of a body: it is bound to the body's nodes, and its points are read once a frame."""
+"""The surface that is shown of a body, bound to its nodes and read once a frame, and its colours."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 import warp as wp
 
 from warp_corot.body.soft_body import SoftBody
+from warp_corot.contact.reading import pressure_at_nodes
+from warp_corot.io.pictures.colors import VertexAverage, round_limit
 from warp_corot.io.write.skins import BoundSkins, OwnSurface, has_domain, joined_surfaces
+from warp_corot.mesh import TetForest
 from warp_corot.mesh.surfaces.bodies import boundary_surface
 from warp_corot.mesh.surfaces.bound import BoundPoints, DeviceBinding, SurfaceMesh, nearest_faces
 from warp_corot.mesh.surfaces.marching import marched
+from warp_corot.simulation.simulation import Simulation
 
 #: The names of surfaces that a body may have. At first the page shows the first of them that the body has.
 INPUT, MARCHED, ELEMENTS = "input's own", "marched", "tetrahedra"
@@ -108,6 +113,10 @@ class Shown:
             faces = nearest_faces(self.positions - middle, self.triangles, (x - middle)[None], 1e3 * size)
         triangle = int(faces[0])
         return Pick(body, triangle, barycentric(self.positions[self.triangles[triangle]].astype(np.float64), x))
+
+    def carried(self, nodal: npt.NDArray[np.floating]) -> npt.NDArray[np.floating]:
+        """Values at the nodes of the shown world, [N], at the points, [V]."""
+        return np.einsum("vn,vn->v", self.binding.weights.numpy(), nodal[self.binding.nodes.numpy()])
 
     def at(self, pick: Pick, values: npt.NDArray[np.floating]) -> npt.NDArray[np.float64]:
         """Values at the points, [V, 3], at a place, float64 [3]."""
@@ -211,3 +220,101 @@ def _between(
     nodes, weights = (np.take_along_axis(each, most, axis=1) for each in (nodes, weights))
     weights /= weights.sum(axis=1, keepdims=True)
     return BoundPoints(surface.points[a] + t * (surface.points[b] - surface.points[a]), nodes, weights)
+
+
+Values: TypeAlias = npt.NDArray[np.floating]
+
+#: A range of colours that is more than this many times too wide becomes narrower.
+TOO_WIDE = 3.0
+#: Colours end at this displacement over the body's size and this stress over Young's modulus at least: smaller ones are
+#: no news, and after a reset there is only rounding.
+LEAST_MOTION, LEAST_STRESS = 1e-3, 1e-2
+
+
+@dataclass(frozen=True)
+class Source:
+    """Values that colours can show.
+
+    Attributes:
+        label: What the values are, for people.
+        unit: The unit of the values.
+        values: The values at the points of a shown surface, [V], for a simulation and one of its bodies.
+        least: The least end of the colours for a shown surface.
+        applies: Whether a body has such values.
+    """
+
+    label: str
+    unit: str
+    values: Callable[[Simulation, Shown], Values]
+    least: Callable[[Shown], float] = lambda _: 0.0
+    applies: Callable[[SoftBody], bool] = lambda _: True
+
+
+def displacement(sim: Simulation, shown: Shown) -> Values:
+    """The distances of the points from their rest positions [m]."""
+    return np.linalg.norm(shown.positions - shown.rest, axis=1)
+
+
+class NodalAverages:
+    """Values of elements [T], averaged to the nodes around them by volume, at the points of a shown surface [V]."""
+
+    def __init__(self) -> None:
+        self._averages: dict[SoftBody, tuple[int, VertexAverage]] = {}
+
+    def __call__(self, values: Values, shown: Shown) -> Values:
+        body = shown.body
+        if body not in self._averages or self._averages[body][0] != body.version:
+            self._averages[body] = body.version, VertexAverage.of(body.mesh)
+        return shown.carried(self._averages[body][1](values))
+
+
+def contact_pressure(sim: Simulation, shown: Shown) -> Values:
+    """Contact pressure in the last step [Pa]: triangles' values, averaged to nodes by area."""
+    body = shown.body
+    pressure = body.contact_pressure.numpy().reshape(body.worlds, -1)[shown.world.index]
+    nodal = pressure_at_nodes(body.contact_surface, body.world_node_count, pressure)
+    return shown.carried(nodal)
+
+
+def _least_motion(shown: Shown) -> float:
+    return LEAST_MOTION * float(np.ptp(shown.rest, axis=0).max(initial=0.0))
+
+
+def _least_stress(shown: Shown) -> float:
+    return LEAST_STRESS * float(np.mean(shown.body.material.isotropic.young))
+
+
+def sources() -> dict[str, Source]:
+    """The sources by name. Sources that keep data of a body belong to one session."""
+    averages = NodalAverages()
+
+    def stress(sim: Simulation, shown: Shown) -> Values:
+        return averages(sim.von_mises(shown.body)[shown.world.elements], shown)
+
+    return {
+        "stress": Source("von Mises stress", "Pa", stress, _least_stress),
+        "displacement": Source("displacement", "m", displacement, _least_motion),
+        "contact pressure": Source(
+            "contact pressure", "Pa", contact_pressure, _least_stress, lambda body: body.state.is_touched
+        ),
+        "level": Source(
+            "level of the mesh",
+            "",
+            lambda _, shown: averages(shown.body.mesh.levels, shown),  # type: ignore[union-attr]
+            applies=lambda body: isinstance(body.mesh, TetForest),
+        ),
+    }
+
+
+class Range:
+    """The range of the colours: from zero to a round number that follows the largest value."""
+
+    def __init__(self) -> None:
+        self.highest = 0.0
+
+    def follow(self, largest: float, least: float) -> float:
+        """The upper end of the range, after values with this maximum; not below ``least``."""
+        largest = max(largest, least)
+        if largest > self.highest or largest < self.highest / TOO_WIDE:
+            self.highest = round_limit(largest)
+        return self.highest

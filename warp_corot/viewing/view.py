@@ -15,9 +15,7 @@ from warp_corot.inputs.checks import checked_flag
 from warp_corot.inputs.checks import shown as as_shown
 from warp_corot.simulation.simulation import Simulation
 
-from .commands import Commands
-from .messages import frame_told, page_told, topology
-from .saving import Saving
+from .commands import Commands, Saving, frame_told, page_told, topology
 from .server import AccessControl, Server, Visitor, is_loopback
 from .session import PageFrame, Session
 

@@ -20,6 +20,7 @@ from warp_corot.kernels.elements.dilatation import Dilatation
 from warp_corot.kernels.elements.elements import ForestElements, nodal_forces, rest_volume
 from warp_corot.kernels.elements.forces import in_local_frame, own_gradient
 from warp_corot.kernels.elements.mean_dilatation_rows import GroupNodes, first_entry
+from warp_corot.kernels.elements.simd8 import LAW_HEADERS
 from warp_corot.kernels.modules import Family
 
 from .cycle import LevelArrays
@@ -266,7 +267,7 @@ def list_midpoints(
         midpoints[2 * i + n] = node
 
 
-OF_MATRIX = Family(__name__)
+OF_MATRIX = Family(__name__, LAW_HEADERS)
 
 
 @wp.kernel(enable_backward=False)

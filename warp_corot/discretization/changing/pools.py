@@ -15,8 +15,7 @@ from warp_corot.discretization.changing.transfer import Carriage, Column, Number
 from warp_corot.discretization.elements import all_frames, device_frames
 from warp_corot.discretization.planner import threads_on
 from warp_corot.errors import InputError
-from warp_corot.inputs.checks import checked_count
-from warp_corot.inputs.device import checked_device
+from warp_corot.inputs.checks import checked_count, checked_device
 from warp_corot.kernels.remesh import pools as kernels
 from warp_corot.kernels.remesh.pools import SINKS
 from warp_corot.kernels.remesh.state import NO_ROW, Carried

@@ -22,23 +22,24 @@ from warp_corot.elasticity.corotated.tangents import (
     subtrees_of,
 )
 from warp_corot.elasticity.cpu import Dilating, SimdForces
-from warp_corot.elasticity.model import ForceField, Kept, StressLaw, Tangent, rotated_material
+from warp_corot.elasticity.model import ForceField, Kept, StressLaw, rotated_material
+from warp_corot.elasticity.tangents import Tangent
 from warp_corot.inputs.cpu_threads import launch
 from warp_corot.inputs.loading import LoadedKernel, load
 from warp_corot.kernels.clusters.laws import isotropic_law
-from warp_corot.kernels.corotated.algebraic import corotated_stress, own_energies, own_von_mises
 from warp_corot.kernels.corotated.corotated import (
+    corotated_stress,
     extract_rotations,
     given_cauchy,
     given_density,
     given_stress,
+    own_energies,
     own_stress,
-    scatter_matrix_product,
+    own_von_mises,
 )
 from warp_corot.kernels.corotated.tangent import exact_differential
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial, RotatedMaterial
 from warp_corot.kernels.elements.forces import element_energies, element_von_mises, scatter_forces
-from warp_corot.kernels.elements.general_cuda import corotated_law
 from warp_corot.kernels.elements.simd8 import LANES
 from warp_corot.kernels.math.rotation import quick_rotation
 from warp_corot.kernels.subtrees import cpu as subtree_cpu
@@ -62,7 +63,7 @@ class Rotations:
 
 
 class CorotatedField(ForceField):
-    """Forces by one kernel if each element uses its own rotation; otherwise by two, rotations first."""
+    """Forces leaf by leaf, by one kernel if each element uses its own rotation; otherwise by two, rotations first."""
 
     #: Whether complete subtrees are units of work.
     takes_subtrees: ClassVar[bool] = False
@@ -72,20 +73,19 @@ class CorotatedField(ForceField):
         super().__init__(discretization, deterministic)
         kind = discretization.element_kind
         self._shared: Rotations | None = None
-        self._fused = model.level is None and model.stiffness == "factored"
+        self._fused = model.level is None
         self._rotated = Kept(rotated_material)
         self._extract = extract_rotations(kind, model.own_rotation)
         self._own = scatter_forces(kind, IsotropicMaterial, own_stress(model.own_rotation))
-        if model.stiffness == "factored":
-            self._forces = scatter_forces(kind, RotatedMaterial, given_stress)
-        else:
-            self._forces = scatter_matrix_product(model.stiffness == "sparse")
+        self._forces = scatter_forces(kind, RotatedMaterial, given_stress)
         self._has_own_outputs = model.level is None and model.own_rotation is quick_rotation
         if self._has_own_outputs:
             self._energies, self._von_mises = own_energies(kind), own_von_mises(kind)
         else:
             self._energies = element_energies(kind, RotatedMaterial, given_density)
             self._von_mises = element_von_mises(kind, RotatedMaterial, given_cauchy)
+        if not self.takes_subtrees:
+            self.follow()
 
     @property
     def kernels(self) -> list[LoadedKernel]:
@@ -107,6 +107,8 @@ class CorotatedField(ForceField):
     def follow(self) -> None:
         super().follow()
         self._shared = None
+        if not self.takes_subtrees and not self._fused:
+            self._sharing()
 
     @property
     def unit_count(self) -> int:
@@ -196,29 +198,15 @@ class CorotatedField(ForceField):
         self.launch(kernel, self.element_count, [self.elements, material, u], [output])
 
 
-class LeafField(CorotatedField):
-    """Leaf by leaf."""
-
-    def __init__(self, discretization: Discretization, model: CorotatedOptions, deterministic: bool):
-        super().__init__(discretization, model, deterministic)
-        if not self._fused:
-            self._sharing()
-
-    def follow(self) -> None:
-        super().follow()
-        if not self._fused:
-            self._sharing()
-
-
 # --- elements in clusters on CUDA ------------------------------------------------------------------------------------
 
 
-class CorotatedGeneralField(LeafField):
+class CorotatedGeneralField(CorotatedField):
     """General elements with own rotations."""
 
     def __init__(self, discretization: Discretization, model: CorotatedOptions):
         super().__init__(discretization, model, deterministic=False)
-        law = isotropic_law(corotated_law(model.own_rotation))
+        law = isotropic_law(corotated_stress)
         self._scatter = ClusterScatter(self.elements, law, chosen=clustered(discretization))
 
     @property
@@ -367,12 +355,11 @@ class SubtreeField(CorotatedField):
     ) -> None:
         own = batch.sharing is Sharing.OWN
         unit = self._no_unit if batch.unit is None else batch.unit
+        material = self.isotropic if own else kept(self.isotropic, self._rotations, unit)
         if self.device.is_cuda:
-            threads, rotations = batch.count, [] if own else [self._rotations, unit]
-            inputs = [batch.subtrees, self.isotropic, u, *rotations]
+            threads, inputs = batch.count, [batch.subtrees, material, u]
             outputs = [f, batch.flagged, NO_LIST if self._degenerate is None else self._degenerate.list_of(batch)]
         else:
-            material = self.isotropic if own else kept(self.isotropic, self._rotations, unit)
             threads, inputs = -(-batch.count // LANES), [batch.subtrees, batch.count, material, u]
             outputs = [f, batch.flagged]
         launch(kernel, threads, inputs, outputs, device=self.device, block_dim=self._block)

@@ -12,7 +12,7 @@ from warp_corot.discretization.plan import GROUPED_LEAVES, Awaited, Batch, FlatL
 from warp_corot.elasticity.clusters import ChangingClusterScatter, ClusterScatter, grouped_and_others
 from warp_corot.inputs.loading import LoadedKernel
 from warp_corot.kernels.clusters.laws import isotropic_law
-from warp_corot.kernels.corotated.algebraic import corotated_stress
+from warp_corot.kernels.corotated.corotated import corotated_stress
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial
 from warp_corot.kernels.subtrees.cuda import FLAT, WorkRange, scatter_body, scatter_subtrees_own
 from warp_corot.kernels.subtrees.degenerate import (

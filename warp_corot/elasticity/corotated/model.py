@@ -12,7 +12,6 @@ from warp_corot.elasticity.anisotropic import AnisotropicCudaField, AnisotropicF
 from warp_corot.elasticity.corotated.fields import (
     CorotatedField,
     CorotatedGeneralField,
-    LeafField,
     SubtreeField,
 )
 from warp_corot.elasticity.dilatation import AUTO, bind_law, check_dilatation
@@ -30,7 +29,6 @@ if TYPE_CHECKING:
     from warp_corot.discretization.discretization import Discretization, Discretized
 
 
-STIFFNESSES = ("factored", "sparse", "dense")
 #: The tolerance of "auto" [rad]. The end of the paper's beam, which sinks by 87 mm, then has an error of 0.24 mm; with
 #: a tolerance of 0.05 it is 0.04 mm, with 0.02 0.005 mm, and with level 3 0.47 mm.
 AUTO_TOLERANCE = 0.1
@@ -43,7 +41,6 @@ class CorotatedOptions(Model):
     rotation_level: int | float | str | None = None
     rotation: str = "byers-xu"
     iterations: int | None = None
-    stiffness: str = "factored"
     subtrees: bool = True
     dilatation: str = AUTO
 
@@ -53,7 +50,6 @@ class CorotatedOptions(Model):
         checked_choice(self.rotation, "rotation", METHODS)
         if self.iterations is not None:
             rotation_function(self.rotation, checked_count(self.iterations, "iterations", 2))
-        checked_choice(self.stiffness, "stiffness", STIFFNESSES)
         checked_flag(self.subtrees, "subtrees")
 
     @property
@@ -104,8 +100,8 @@ class Corotated(CorotatedOptions):
 
     Anisotropic materials always have own rotations and conserve both momenta, too (see ``AnisotropicField``).
 
-    With the defaults, forests use the fast path: complete three-level subtrees as units of work. With any other
-    rotation, iterations or stiffness, forces are computed leaf by leaf.
+    With the defaults, forests use the fast path: complete three-level subtrees as units of work. With another
+    rotation or iterations, forces are computed leaf by leaf.
 
     Attributes:
         rotation_level: None: every element has its own rotation. An int: the rotation of the ancestor at that level of
@@ -118,8 +114,6 @@ class Corotated(CorotatedOptions):
             most (2 mu + 3 lambda) (3 w |U - I| + w^2 |U|); energies use own rotations.
         rotation: "byers-xu" (the paper's) or "svd" (McAdams et al. 2011).
         iterations: For "byers-xu": None iterates to the paper's tolerance 3.85e-5; an int from 2 to 12 is the number.
-        stiffness: "factored" (sums and differences), "sparse" (the paper's explicit K_T by type, zeros skipped) or
-            "dense" (the same with all 144 products); the last two for forests only. All agree to rounding.
         subtrees: False: leaf by leaf even if the fast path is possible, as in the paper; for comparison.
         dilatation: "element": each element has its own dilatation, tr(R^T F) - 3, as in the paper, and nearly
             incompressible tissue is too stiff. "shared": elements share their dilatations J - 1, see
@@ -136,31 +130,24 @@ class Corotated(CorotatedOptions):
     def _bind(self, discretization: Discretization, deterministic: bool) -> CorotatedField | AnisotropicField:
         if discretization.is_anisotropic:
             return self._bind_anisotropic(discretization, deterministic)
-        fast = self.rotation == "byers-xu" and self.iterations is None and self.stiffness == "factored"
-        fast = fast and self.subtrees
+        fast = self.rotation == "byers-xu" and self.iterations is None and self.subtrees
         if isinstance(discretization.mesh, TetForest):
             if fast:
                 return SubtreeField(discretization, self, deterministic)
         elif self.level is not None:
             raise InputError(f"rotation_level {self.rotation_level} needs a forest; a general mesh has no tree")
-        elif self.stiffness != "factored":
-            raise InputError(f"stiffness {self.stiffness!r} needs a forest; general elements have no three shapes")
         elif fast and discretization.device.is_cpu:
             return SubtreeField(discretization, self, deterministic)
         elif fast and not deterministic:
             return CorotatedGeneralField(discretization, self)
-        return LeafField(discretization, self, deterministic)
+        return CorotatedField(discretization, self, deterministic)
 
     def _bind_anisotropic(self, discretization: Discretization, deterministic: bool) -> AnisotropicField:
         if not isinstance(discretization.material, Anisotropic):
             name = type(discretization.material).__name__
             raise InputError(f"the material is {name}; only the model HolzapfelGasserOgden supports this material")
-        for name, given, wanted in (
-            ("rotation_level", self.rotation_level, None),
-            ("stiffness", self.stiffness, "factored"),
-        ):
-            if given != wanted:
-                raise InputError(f"{name} is {given!r}; with an anisotropic material it must be {wanted!r}")
+        if self.rotation_level is not None:
+            raise InputError(f"rotation_level is {self.rotation_level!r}; with an anisotropic material it must be None")
         quick = self.own_rotation is quick_rotation
         if quick and discretization.device.is_cuda and not deterministic:
             return AnisotropicCudaField(discretization)

@@ -10,7 +10,8 @@ import warp as wp
 
 from warp_corot.discretization.plan import Batch, Sharing
 from warp_corot.elasticity.cpu import as_general
-from warp_corot.elasticity.model import ElementTangent, Kept, Tangent
+from warp_corot.elasticity.model import Kept
+from warp_corot.elasticity.tangents import ElementTangent, Tangent
 from warp_corot.kernels.corotated import turned_subtrees as kernels
 from warp_corot.kernels.corotated.tangent import (
     EXACT_PLACES,

@@ -14,51 +14,63 @@ import warp as wp
 
 from warp_corot.body.keyframes import Activation, followed_stress
 from warp_corot.body.soft_body import SoftBody
+from warp_corot.contact.options import Contact
+from warp_corot.discretization.changing.passes import Findings
 from warp_corot.elasticity import MODELS, ForceField, Model
 from warp_corot.errors import InputError, StabilityWarning
 from warp_corot.inputs.checks import checked_path
 from warp_corot.io.files.quiet import bounded
 from warp_corot.io.files.whole import written_whole
-from warp_corot.materials.anisotropic import Orthotropic, TransverselyIsotropic
+from warp_corot.materials.anisotropic import FibreReinforced, Orthotropic, TransverselyIsotropic
 from warp_corot.materials.isotropic import Isotropic
-from warp_corot.materials.reinforced import FibreReinforced
 from warp_corot.mesh import TetForest, TetMesh
+from warp_corot.mesh.surfaces.marching import Detail
+from warp_corot.remesh.carried_material import Keys
+from warp_corot.remesh.conditions import Row
 from warp_corot.remesh.remeshing import OnlineRemesh
 from warp_corot.simulation.simulation import Simulation
 from warp_corot.solvers import INTEGRATORS
 
-from .contents import (
-    blades_of,
-    obstacles_of,
-    pack_blades,
-    pack_changing,
-    pack_contact,
-    pack_mesh,
-    remesh_options,
-    unpack_blades,
-    unpack_changing,
-    unpack_contact,
-    unpack_mesh,
-)
+from . import contents
 
 if TYPE_CHECKING:
     from warp_corot.remesh.changing import Changing
 
-# --- trees of plain values and arrays: JSON, and the arrays beside it ------------------------------------------------
+# --- trees of plain values, arrays and listed dataclasses: JSON, and the arrays beside it ----------------------------
 
 Arrays = dict[str, np.ndarray]
 #: The only key of what stands for an array in JSON; its value is the array's name.
 ARRAY = "array"
+#: The keys of what stands for a dataclass: its name and the values of its fields.
+INSTANCE = ("kind of", "values")
+
+
+def kinds() -> dict[str, Any]:
+    """The dataclasses that checkpoints hold, by name: laws and integrators that are listed, materials, and parts."""
+    listed: list[Any] = [*MODELS.values(), *INTEGRATORS.values(), Contact, Detail, Findings, Keys, Row]
+    listed += [Isotropic, TransverselyIsotropic, Orthotropic, FibreReinforced]
+    return {kind.__name__: kind for kind in listed}
 
 
 def split(tree: Any, name: str = "") -> tuple[Any, Arrays]:
-    """A tree of dictionaries, lists and tuples without its arrays, and the arrays [any shape], named by the keys and
-    numbers on the way to them, with dots; arrays of Warp are read.
+    """A tree of dictionaries, lists, tuples and dataclasses without its arrays, and the arrays [any shape], named by
+    the keys and numbers on the way to them, with dots; arrays of Warp are read.
+
+    Raises:
+        InputError: A dataclass that is none of `kinds`, such as a law of your own.
     """
     if isinstance(tree, wp.array):
         tree = tree.numpy()
     if isinstance(tree, np.ndarray):
         return {ARRAY: name}, {name: tree}
+    if dataclasses.is_dataclass(tree):
+        kind = type(tree).__name__
+        if kinds().get(kind) is not type(tree):
+            raise InputError(f"a {kind} cannot be saved; only {', '.join(kinds())}")
+        values = {each.name: getattr(tree, each.name) for each in dataclasses.fields(tree)}
+        tree = {INSTANCE[0]: kind, INSTANCE[1]: values}
+    if isinstance(tree, np.generic):
+        return tree.item(), {}
     if not isinstance(tree, dict | list | tuple):
         return tree, {}
     arrays: Arrays = {}
@@ -79,7 +91,8 @@ def joined(plain: Any, arrays: Arrays) -> Any:
     if isinstance(plain, dict):
         if plain.keys() == {ARRAY}:
             return arrays[plain[ARRAY]]
-        return {key: joined(value, arrays) for key, value in plain.items()}
+        found = {key: joined(value, arrays) for key, value in plain.items()}
+        return kinds()[found[INSTANCE[0]]](**found[INSTANCE[1]]) if found.keys() == set(INSTANCE) else found
     return [joined(value, arrays) for value in plain] if isinstance(plain, list) else plain
 
 
@@ -90,8 +103,6 @@ Remesh = OnlineRemesh | Sequence[OnlineRemesh | None] | None
 FORMAT = "warp-corot checkpoint"
 #: The version of checkpoints that is written, and the only one that is read.
 VERSION = 13
-
-MATERIALS = {kind.__name__: kind for kind in (Isotropic, TransverselyIsotropic, Orthotropic, FibreReinforced)}
 
 
 def save_checkpoint(sim: Simulation, path: str | PathLike[str], *, in_parts: bool = False) -> None:
@@ -111,7 +122,7 @@ def save_checkpoint(sim: Simulation, path: str | PathLike[str], *, in_parts: boo
     if target.is_dir():
         raise InputError(f"cannot save {target}: it is a folder")
     packed = zip(sim.bodies, sim.models, sim.fields, sim.remeshing.changing, strict=True)
-    cuts = pack_blades(sim.blades) | {"stable_steps": sim.stable_steps} if sim.remeshing.are_cut else None
+    cuts = contents.pack_blades(sim.blades) | {"stable_steps": sim.stable_steps} if sim.remeshing.are_cut else None
     plain, arrays = split(
         {
             "format": FORMAT,
@@ -121,7 +132,7 @@ def save_checkpoint(sim: Simulation, path: str | PathLike[str], *, in_parts: boo
             "steps_before_reset": sim.steps_before_reset,
             "time_before_reset": sim.time_before_reset,
             "gravity": sim.gravity,
-            "integrator": described_of(sim.integrator, INTEGRATORS),
+            "integrator": sim.integrator,
             "deterministic": sim.deterministic,
             "worlds": sim.worlds,
             "bodies": [pack_body(*each) for each in packed],
@@ -129,7 +140,7 @@ def save_checkpoint(sim: Simulation, path: str | PathLike[str], *, in_parts: boo
             "guard": sim.guard.state,
             "running": sim.running.state,
             "cuts": cuts,
-            "contact": pack_contact(sim.contact, sim.grasps),
+            "contact": contents.pack_contact(sim.contact, sim.grasps),
         }
         | ({"in_parts": True} if in_parts else {})
     )
@@ -149,16 +160,15 @@ def pack_body(
     mesh, material = body.mesh, body.material
     if changing is not None:
         mesh, material = changing.forest.source, changing.carried_material.given
-    values = {each.name: np.asarray(getattr(material, each.name)) for each in dataclasses.fields(material)}
     return {
-        "model": described_of(model, MODELS),
-        "mesh": pack_mesh(mesh) if with_mesh else None,
-        "material": {"name": _name_of(material, MATERIALS), "values": values},
+        "model": model,
+        "mesh": contents.pack_mesh(mesh) if with_mesh else None,
+        "material": material,
         "threads": body.threads,
         "world_starts": body.conditions.world_starts,
         "field": field.state,
         "state": None if changing is not None else _pack_state(body),
-        "remesh": None if changing is None else pack_changing(changing),
+        "remesh": None if changing is None else contents.pack_changing(changing),
     }
 
 
@@ -218,17 +228,17 @@ def load_checkpoint(
 
 def _rebuilt_simulation(tree: dict[str, Any], device: str | wp.Device | None, remesh: Remesh) -> Simulation:
     place = tree["device"] if device is None else device
-    touching = obstacles_of(tree["contact"])
+    touching = contents.obstacles_of(tree["contact"])
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", StabilityWarning)  # the warning was shown when the simulation was made
         sim = Simulation(
             [rebuilt_body(packed, tree["worlds"], place) for packed in tree["bodies"]],
-            model=[rebuilt(packed["model"], MODELS) for packed in tree["bodies"]],
-            integrator=rebuilt(tree["integrator"], INTEGRATORS),
+            model=[packed["model"] for packed in tree["bodies"]],
+            integrator=tree["integrator"],
             gravity=tree["gravity"],
             deterministic=tree["deterministic"],
-            remesh=remesh_options(tree["bodies"], place, remesh, touching.get("obstacles", ())),
-            cuts=blades_of(tree["cuts"]),
+            remesh=contents.remesh_options(tree["bodies"], place, remesh, touching.get("obstacles", ())),
+            cuts=contents.blades_of(tree["cuts"]),
             **touching,
         )
     sim.steps_before_reset, sim.time_before_reset = tree["steps_before_reset"], tree["time_before_reset"]
@@ -237,7 +247,7 @@ def _rebuilt_simulation(tree: dict[str, Any], device: str | wp.Device | None, re
     bodies = zip(tree["bodies"], sim.bodies, sim.fields, sim.remeshing.changing, strict=True)
     for packed, body, field, changing in bodies:
         if changing is not None and packed["remesh"] is not None:
-            unpack_changing(changing, packed["remesh"])
+            contents.unpack_changing(changing, packed["remesh"])
         body.conditions.world_starts.assign(packed["world_starts"].astype(np.float64))
         for name, values in packed["field"].items():
             field.state[name].assign(values)
@@ -245,8 +255,8 @@ def _rebuilt_simulation(tree: dict[str, Any], device: str | wp.Device | None, re
         sim.kept[name].assign(values)
     if tree["cuts"] is not None:
         sim.stable_steps = tree["cuts"]["stable_steps"]
-        unpack_blades(sim.blades, tree["cuts"])
-    unpack_contact(sim.contact, tree["contact"])
+        contents.unpack_blades(sim.blades, tree["cuts"])
+    contents.unpack_contact(sim.contact, tree["contact"])
     sim.guard.resume(**tree["guard"])
     sim.running.resume(**tree["running"])
     return sim
@@ -256,10 +266,8 @@ def rebuilt_body(
     packed: dict[str, Any], worlds: int, device: str | wp.Device, mesh: TetForest | TetMesh | None = None
 ) -> SoftBody:
     """The body that ``pack_body`` packed, with another mesh if it was packed without."""
-    values = {name: value[()] for name, value in packed["material"]["values"].items()}
-    material = MATERIALS[packed["material"]["name"]](**values)
-    mesh = unpack_mesh(packed["mesh"]) if mesh is None else mesh
-    body = SoftBody(mesh, material, worlds=worlds, device=device, threads=packed["threads"])
+    mesh = contents.unpack_mesh(packed["mesh"]) if mesh is None else mesh
+    body = SoftBody(mesh, packed["material"], worlds=worlds, device=device, threads=packed["threads"])
     if packed["state"] is not None:
         _unpack_state(body, packed["state"])
     elif packed["remesh"]["loads"]:
@@ -284,26 +292,3 @@ def _unpack_state(body: SoftBody, state: dict[str, Any]) -> None:
     body.displacements = state["displacements"][:, :3]
     body.state.set_velocities(state["velocities"][:, :3])
     body.state.reactions.assign(state["reactions"])
-
-
-def described_of(thing: Any, names: dict[str, Any]) -> dict[str, Any]:
-    """A listed dataclass of plain values or of other listed ones, for JSON: its name in the list and its values."""
-    values = dataclasses.asdict(thing)
-    for name in values:
-        if type(getattr(thing, name)) in names.values():
-            values[name] = described_of(getattr(thing, name), names)
-    return {"name": _name_of(thing, names), "values": values}
-
-
-def _name_of(thing: Any, names: dict[str, Any]) -> str:
-    for name, cls in names.items():
-        if type(thing) is cls:
-            return name
-    raise InputError(f"a {type(thing).__name__} cannot be saved; only {', '.join(c.__name__ for c in names.values())}")
-
-
-def rebuilt(described: dict[str, Any], names: dict[str, Any]) -> Any:
-    """What ``described_of`` has described."""
-    values = described["values"]
-    parts = {name: rebuilt(value, names) for name, value in values.items() if isinstance(value, dict)}
-    return names[described["name"]](**(values | parts))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import importlib
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -14,18 +14,14 @@ import warp as wp
 from warp_corot.contact.carried import keep_again, kept_arrays
 from warp_corot.contact.contacts import Contacts
 from warp_corot.contact.grasp import Grasp
-from warp_corot.contact.options import Contact
 from warp_corot.contact.shapes import Box, Capsule, Cylinder, Ground, Shape, SignedDistance, Sphere, TriangleMesh
 from warp_corot.contact.tool import Obstacle, Tool
 from warp_corot.cutting.blade import Blade, Edge
-from warp_corot.discretization.changing.passes import Findings
 from warp_corot.discretization.changing.pools import Piece, Snapshot, array_of, check_places
 from warp_corot.errors import InputError
 from warp_corot.mesh import TetForest, TetMesh, Tree
-from warp_corot.mesh.surfaces.marching import Detail
 from warp_corot.mesh.tree import UniformTree
-from warp_corot.remesh.carried_material import Keys
-from warp_corot.remesh.conditions import KEPT, Row
+from warp_corot.remesh.conditions import KEPT
 from warp_corot.remesh.remeshing import OnlineRemesh
 
 if TYPE_CHECKING:
@@ -35,8 +31,6 @@ if TYPE_CHECKING:
 
 # --- meshes ----------------------------------------------------------------------------------------------------------
 
-#: Fields of surfaces that are finer than their mesh.
-DETAIL = ("points", "tets", "phi", "labels", "sharp_points", "sharp_triangles")
 #: Fields of trees.
 OF_TREE = tuple(field.name for field in dataclasses.fields(Tree))
 #: Fields of forests that were made from a domain, or cut.
@@ -56,7 +50,7 @@ def pack_mesh(mesh: TetForest | TetMesh) -> dict[str, Any]:
         "lattice": mesh.lattice,
         "node_ends": mesh.node_ends,
         "tree": {name: getattr(mesh.tree, name) for name in OF_TREE},
-        "detail": None if mesh.detail is None else {name: getattr(mesh.detail, name) for name in DETAIL},
+        "detail": mesh.detail,
         "of_domain": {name: getattr(mesh, name) for name in OF_DOMAIN},
         "label_names": mesh.label_names,
     }
@@ -84,11 +78,8 @@ def unpack_mesh(packed: dict[str, Any]) -> TetForest | TetMesh:
         return TetForest.box(cells, size, packed["level"], origin=origin, up_axis=up_axis)
     tree, lattice, ends = Tree(**packed["tree"]), packed["lattice"], packed["node_ends"]
     _check_tree(tree, lattice, ends)
-    detail = None if packed["detail"] is None else Detail(**packed["detail"])
-    names = tuple(packed["label_names"])
-    return TetForest(
-        cells, size, origin, lattice, ends, tree, up_axis, label_names=names, detail=detail, **packed["of_domain"]
-    )
+    more = packed["of_domain"] | {"label_names": tuple(packed["label_names"]), "detail": packed["detail"]}
+    return TetForest(cells, size, origin, lattice, ends, tree, up_axis, **more)
 
 
 def _check_tree(tree: Tree, lattice: np.ndarray, ends: np.ndarray) -> None:
@@ -127,8 +118,6 @@ SHAPES: dict[str, Callable[..., Shape]] = {
 OF_SHAPES = ("points", "triangles", "values", "lower")
 #: Numbers of the law that steps have found.
 LAW = ("tolerance", "recovery", "grain", "whole")
-#: Options of contact.
-OPTIONS = ("friction", "self_contact", "flat_edges", "on")
 
 
 def pack_contact(contacts: Contacts | None, grasps: Sequence[Grasp]) -> dict[str, Any] | None:
@@ -168,15 +157,14 @@ def pack_obstacles(contacts: Contacts) -> dict[str, Any]:
         InputError: A shape of a class of your own.
     """
     given = zip(contacts.obstacles.given, contacts.obstacles.tools, strict=True)
-    options = {name: getattr(contacts.options, name) for name in OPTIONS}
-    return {"options": options, "obstacles": [_pack_tool(tool, each is tool) for each, tool in given]}
+    return {"options": contacts.options, "obstacles": [_pack_tool(tool, each is tool) for each, tool in given]}
 
 
 def obstacles_of(packed: dict[str, Any] | None) -> dict[str, Any]:
     """The arguments ``obstacles`` and ``contact`` of a simulation."""
     if packed is None:
         return {}
-    return {"obstacles": list(map(_unpacked_tool, packed["obstacles"])), "contact": Contact(**packed["options"])}
+    return {"obstacles": list(map(_unpacked_tool, packed["obstacles"])), "contact": packed["options"]}
 
 
 def unpack_contact(contacts: Contacts | None, packed: dict[str, Any] | None) -> None:
@@ -285,13 +273,13 @@ def pack_changing(changing: Changing) -> dict[str, Any]:
         "parameters": options.parameters,
         "near": None if options.near is None else options.near.place_among_obstacles()[1],
         "conditions": conditions.kept,
-        "rows": [[k, row.times, row.displacements] for k, row in conditions.keyframes.rows.items()],
+        "rows": [[k, row] for k, row in conditions.keyframes.rows.items()],
         "between": [[*ends, row] for ends, row in conditions.keyframes.between.items()],
         "loads": changing.body.conditions.has_loads,
         "activation": changing.body.discretization.has_activation,
-        "activation_rows": [[each.first, each.times, each.stress] for each in conditions.activation.keys],
+        "activation_rows": conditions.activation.keys,
         "at_beginning": conditions.of_present_mesh,
-        "survey": asdict(changing.survey.last),
+        "survey": changing.survey.last,
         "initial": _pack_snapshot(forest.remembered),
         "present": _pack_snapshot(Snapshot.of(forest.pools, forest.carriage.arrays)),
     }
@@ -304,13 +292,13 @@ def unpack_changing(changing: Changing, packed: dict[str, Any]) -> None:
     _unpacked_snapshot(kept_in, packed["initial"]).restore(*kept_in)
     forest.remember()
     _unpacked_snapshot(kept_in, packed["present"]).restore(*kept_in)
-    keyframes.rows = {k: Row(times, displacements) for k, times, displacements in packed["rows"]}
+    keyframes.rows = dict(packed["rows"])
     keyframes.between = {(a, b): row for a, b, row in packed["between"]}
     if packed["activation"]:
         _ = body.activation  # made on first use
     changing.renew()
     activation = changing.conditions.activation
-    activation.keys = [Keys(*row) for row in packed["activation_rows"]]
+    activation.keys = packed["activation_rows"]
     if activation.keys:
         activation.serve()
     rows = forest.carriage.arrays.row[: body.node_count].numpy()
@@ -320,7 +308,7 @@ def unpack_changing(changing: Changing, packed: dict[str, Any]) -> None:
         name: wp.array(values, dtype=KEPT[name], device=body.device) for name, values in packed["conditions"].items()
     }
     changing.conditions.set_kept(kept, of_present_mesh=packed["at_beginning"])
-    changing.survey.last = Findings(**packed["survey"])
+    changing.survey.last = packed["survey"]
 
 
 def remesh_options(

@@ -56,14 +56,15 @@ def writing(target: Path) -> Iterator[None]:
 
 @contextmanager
 def written_whole(target: Path) -> Iterator[Path]:
-    """A path beside ``target`` to write to: at the end of the block it is synced and renamed over ``target``.
+    """A path beside ``target``, with its extension, to write to: at the end of the block it is synced and renamed over
+    ``target``.
 
     If an exception is raised, it is removed and ``target`` stays unchanged.
 
     Raises:
         WriteError: It cannot be written.
     """
-    part = target.with_name(f".{target.name}.{uuid.uuid4().hex[:8]}.part")
+    part = target.with_name(f".{target.stem}.{uuid.uuid4().hex[:8]}.part{target.suffix}")
     try:
         with writing(target):
             yield part

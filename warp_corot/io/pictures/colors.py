@@ -1,7 +1,13 @@
 """The colour map of stresses: light for none, dark for much, perceptually uniform."""
 
+from __future__ import annotations
+
+from typing import Any
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
+from warp_corot.mesh.topology import signed_volumes
 
 # Seventeen evenly spaced colours of Matplotlib's "magma" (CC0) from 0.97 down to 0.25, sRGB. The ends, near-black and
 # near-white, are left out, so that a shaded body keeps its shape in every colour.
@@ -56,6 +62,11 @@ class VertexAverage:
         self._nodes = nodes
         total = self._sums(self._weights)
         self._inverse = 1.0 / np.where(total > 0.0, total, 1.0)
+
+    @classmethod
+    def of(cls, mesh: Any) -> VertexAverage:
+        """The average of a mesh with points [N, 3] and tetrahedra [T, 4], weighted with their volumes."""
+        return cls(mesh.tets, np.abs(signed_volumes(mesh.points, mesh.tets)), len(mesh.points))
 
     def __call__(self, values: ArrayLike) -> NDArray[np.float64]:
         return self._sums(np.asarray(values, dtype=np.float64) * self._weights) * self._inverse

@@ -1,10 +1,10 @@
-"""Pictures of deformed bodies as PNG files: one body, or several side by side, with titles and a colour bar."""
+"""Pictures of deformed bodies as PNG files, side by side, with titles and a colour bar; films by Pillow or imageio."""
 
 from __future__ import annotations
 
 import functools
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from importlib.util import find_spec
 from pathlib import Path
@@ -204,3 +204,68 @@ def save_picture(picture: Image, target: Path) -> None:
     """Write to a temporary file and rename it, so that a failure does not destroy a good picture."""
     with written_whole(target) as part:
         picture.save(part, format="PNG")
+
+
+FILMS = (".gif", ".mp4")
+#: Viewers show at most this many frames of a GIF a second; frames in between are left out.
+GIF_FPS = 25.0
+#: About this many frames determine the colours of a GIF.
+PALETTE_FRAMES = 16
+
+
+def check_film(path: Path) -> None:
+    """Check that the package for a film is installed.
+
+    Raises:
+        InputError: It is not.
+    """
+    if path.suffix.lower() == ".mp4" and not (find_spec("imageio") and find_spec("imageio_ffmpeg")):
+        raise InputError(f'{path}: films as .mp4 need: pip install "warp-corot[film]"; a .gif needs no package')
+
+
+def frames_shown(path: Path, frames: list[int], fps: float) -> tuple[list[int], float]:
+    """The frames that a film shows, and their number per second."""
+    every = max(int(np.ceil(fps / GIF_FPS - 1e-9)), 1) if path.suffix.lower() == ".gif" else 1
+    return frames[::every], fps / every
+
+
+def write_film(path: Path, images: Iterator[Image], fps: float) -> None:
+    """Write a film, completely or not at all.
+
+    Args:
+        path: A .gif or .mp4 file.
+        images: Images of equal size.
+        fps: Images per second.
+
+    Raises:
+        OSError: It cannot be written; a former film stays.
+    """
+    with written_whole(path) as part:
+        (_write_gif if path.suffix.lower() == ".gif" else _write_mp4)(part, images, fps)
+
+
+def _write_gif(path: Path, images: Iterator[Image], fps: float) -> None:
+    from PIL import Image
+
+    # One palette for all, to avoid flicker; from pictures of the whole film, since their colours differ.
+    frames = list(images)
+    some = [frame.reduce(2) for frame in frames[:: -(-len(frames) // PALETTE_FRAMES)]]
+    together = Image.new("RGB", (some[0].width, some[0].height * len(some)))
+    for number, frame in enumerate(some):
+        together.paste(frame, (0, number * frame.height))
+    palette = together.quantize(colors=256, method=Image.Quantize.MEDIANCUT)
+    flat = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
+    hundredths = max(round(100.0 / fps), 2)
+    flat[0].save(
+        path, format="GIF", save_all=True, append_images=flat[1:], duration=10 * hundredths, loop=0, optimize=True
+    )
+
+
+def _write_mp4(path: Path, images: Iterator[Image], fps: float) -> None:
+    from imageio.v2 import get_writer
+
+    options = {"codec": "libx264", "quality": 8, "macro_block_size": 2, "ffmpeg_log_level": "error"}
+    writer: Any
+    with get_writer(path, format="FFMPEG", mode="I", fps=fps, **options) as writer:
+        for image in images:
+            writer.append_data(np.asarray(image))

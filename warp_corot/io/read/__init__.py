@@ -1,6 +1,5 @@
 """Readers of mesh files, one module for each family of formats."""
 
-from .filemesh import Block, FileMesh, split_solids, triangles_of
-from .files import SUFFIXES, read_mesh_file
+from .filemesh import SUFFIXES, Block, FileMesh, read_mesh_file, split_solids, triangles_of
 
 __all__ = ["SUFFIXES", "Block", "FileMesh", "read_mesh_file", "split_solids", "triangles_of"]

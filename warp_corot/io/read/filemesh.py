@@ -1,14 +1,22 @@
-"""The content of a file: points, blocks of cells, and numbers that distinguish regions; or voxels."""
+"""The content of a file: points, blocks of cells and numbers of regions, or the voxels of a scan; and its readers."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
-from itertools import pairwise
+import importlib
+import importlib.util
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass, field, replace
+from os import PathLike
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from warp_corot.errors import InputError
+from warp_corot.inputs.checks import checked_numbers, checked_vector, shown
+from warp_corot.io.files.quiet import bounded, quietly
 
 #: Numbers of corners of cells with volume, by kind.
 SOLIDS = {"tetra": 4, "pyramid": 5, "wedge": 6, "hexahedron": 8}
@@ -17,11 +25,6 @@ FACES = {"triangle": 3, "quad": 4}
 CORNERS = {**SOLIDS, **FACES}
 #: Arrays with more distinct numbers than this do not define node sets.
 MOST_SETS = 32
-#: Arrays of VTK that number neither regions nor sets of nodes.
-INTERNAL = (
-    *("vtkGhostType", "vtkOriginalCellIds", "vtkOriginalPointIds"),
-    *("GlobalCellIds", "GlobalElementId", "GlobalPointIds", "GlobalNodeId"),
-)
 
 
 class Unreadable(Exception):
@@ -96,20 +99,25 @@ class FileMesh:
 
 
 @dataclass(frozen=True)
-class FileImage:
-    """The voxels of a file, see `warp_corot.io.read.volumes.LoadedVolume`.
+class LoadedVolume:
+    """The voxels of a file.
 
     Attributes:
-        values: [nx, ny, nz].
-        affine: From voxel indices to positions, float64 [4, 4].
+        values: [nx, ny, nz], with the file's own number type.
+        affine: Matrix from voxel indices to positions in ``unit``, float64 [4, 4]; right-anterior-superior if the
+            format names directions.
         notes: Notes for the user, one line each.
         unit: "m", "cm", "mm", or None if the file does not say.
+        name: Short name for a title.
+        source: The file.
     """
 
     values: NDArray[Any]
     affine: NDArray[np.float64]
-    notes: list[str]
+    notes: list[str] = field(default_factory=list)
     unit: str | None = None
+    name: str = ""
+    source: Path = Path()
 
 
 def joined_triangles(parts: Iterable[tuple[str, NDArray[Any], NDArray[Any]]], **about: Any) -> FileMesh:
@@ -139,30 +147,6 @@ def sets_of_numbers(name: str, values: NDArray[np.int64]) -> dict[str, NDArray[n
     if numbers.tolist() == [1]:
         return {name: np.flatnonzero(values)}
     return {f"{name}_{number}": np.flatnonzero(values == number) for number in numbers.tolist()}
-
-
-def whole(word: str) -> int:
-    """Convert a text to a whole number.
-
-    Raises:
-        Unreadable: It is not a whole number.
-    """
-    try:
-        return int(word)
-    except ValueError:
-        raise Unreadable(f"{word[:40]!r} is not a whole number") from None
-
-
-def real(word: str) -> float:
-    """Convert a text to a number; the exponent may have Fortran's letter D.
-
-    Raises:
-        Unreadable: It is not a number.
-    """
-    try:
-        return float(word.replace("D", "e").replace("d", "e"))
-    except ValueError:
-        raise Unreadable(f"{word[:40]!r} is not a number") from None
 
 
 def corners_note(kind: str, order: int | None = 2) -> str:
@@ -235,19 +219,6 @@ def triangles_of(blocks: Iterable[Block]) -> NDArray[np.int64]:
     return np.concatenate(found)
 
 
-def split_polyhedron(faces: Sequence[Sequence[int]]) -> list[tuple[int, int, int, int]]:
-    """The tetrahedra of one convex cell of any kind, given by the corners of its faces, by the same rule."""
-    apex = min(min(face) for face in faces)
-    return [(a, b, c, apex) for face in faces if apex not in face for a, b, c in fan(face)]
-
-
-def fan(polygon: Sequence[int]) -> list[tuple[int, int, int]]:
-    """The triangles of a convex polygon around its corner with the smallest number."""
-    start = min(range(len(polygon)), key=polygon.__getitem__)
-    turned = [*polygon[start:], *polygon[:start]]
-    return [(turned[0], b, c) for b, c in pairwise(turned[1:])]
-
-
 def _cones(block: Block) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     nodes, outsides = block.nodes, OUTSIDES[block.kind]
     lowest = np.argmin(nodes, axis=1)
@@ -287,3 +258,197 @@ def _wound_alike(
     tets = tets.copy()
     tets[turned] = tets[turned][:, [0, 1, 3, 2]]
     return tets, int(np.count_nonzero(size - np.abs(total) > 1e-6 * size))
+
+
+@dataclass(frozen=True)
+class Reader:
+    """A module of this folder with a function that reads a path.
+
+    Attributes:
+        name: Its name in messages.
+        module: The module of this folder whose ``read`` it is.
+        package: The Python package that it needs, if any.
+        extra: The extra that installs this package, as in ``pip install "warp-corot[EXTRA]"``.
+    """
+
+    name: str
+    module: str
+    package: str | None = None
+    extra: str | None = None
+
+
+VTK = Reader("VTK", "vtk_files", "vtkmodules", "mesh")
+MESHIO = Reader("meshio", "meshio_files")
+ITK = Reader("SimpleITK", "itk_files", "SimpleITK", "scans")
+BY_MESHIO = (
+    *(".msh", ".mesh", ".meshb", ".bdf", ".nas", ".fem", ".inp", ".node", ".ele", ".vol", ".vol.gz", ".xdmf", ".xmf"),
+    *(".e", ".ex2", ".exo", ".med", ".cgns", ".h5m", ".avs", ".su2", ".f3grid", ".mdpa", ".post", ".dato", ".ugrid"),
+    *(".tec", ".xml"),
+)
+#: Readers by extension, starting with the most complete one.
+READERS: dict[str, tuple[Reader, ...]] = {
+    **dict.fromkeys(BY_MESHIO, (MESHIO,)),
+    **dict.fromkeys((".vtk", ".vtu"), (VTK, MESHIO)),
+    **dict.fromkeys((".vtp", ".vtm", ".vtmb", ".vts", ".vtr", ".pvtu", ".pvtp", ".vtkhdf"), (VTK,)),
+}
+#: Readers of scans by extension.
+SCANS: dict[str, tuple[Reader, ...]] = {
+    **dict.fromkeys((".nii.gz", ".nii", ".mha", ".mhd", ".nrrd", ".nhdr", ".dcm"), (ITK,)),
+    ".vti": (VTK,),
+}
+#: The extensions of all these files.
+SUFFIXES = (*READERS, *SCANS)
+#: Errors whose texts are no sentences.
+WORDLESS = (LookupError, AttributeError, TypeError, StopIteration, AssertionError)
+#: Longer reasons are truncated.
+LONGEST_REASON = 200
+
+
+def suffix_of(path: Path) -> str | None:
+    """The file's extension if it is that of a mesh file or a scan, else None."""
+    name = path.name.lower()
+    return next((suffix for suffix in sorted(SUFFIXES, key=len, reverse=True) if name.endswith(suffix)), None)
+
+
+def read_mesh_file(path: Path) -> FileMesh | LoadedVolume:
+    """Read a mesh file, a scan, or a folder with a DICOM series.
+
+    Readers are tried one after the other until one can read the file.
+
+    Args:
+        path: A file with one of the extensions `SUFFIXES`, or a folder.
+
+    Returns:
+        Points and cells; or the voxels of a scan.
+
+    Raises:
+        InputError: No installed reader can read it; one line with the readers' own reasons.
+    """
+    suffix = "DICOM" if path.is_dir() else suffix_of(path)
+    if suffix is None:
+        raise InputError(f"{path}: unknown format {path.suffix or '(no extension)'}; it must be {', '.join(SUFFIXES)}")
+    reasons, missing = [], []
+    for reader in (READERS | SCANS).get(suffix, (ITK,)):
+        if reader.package and importlib.util.find_spec(reader.package) is None:
+            missing.append(reader)
+            continue
+        found, reason = read_with(reader.module, path)
+        if isinstance(found, LoadedVolume):
+            return found
+        if found is not None and len(found.points):
+            return checked_mesh(found, path)
+        if found is not None:
+            reason = "it finds no nodes in it"
+        if reason:
+            reasons.append(f"{reader.name}: {shortened(reason)}")
+    cures = " or ".join(f'pip install "warp-corot[{reader.extra}]"' for reader in missing)
+    if not reasons and missing:
+        raise InputError(f"{path}: reading {suffix} files needs: {cures}")
+    also = f"; {missing[0].name} might read it: {cures}" if missing else ""
+    what = "is a folder without a DICOM series" if path.is_dir() else f"is not a {suffix} file"
+    raise InputError(f"{path}: {what} that can be read ({'; '.join(reasons)}){also}")
+
+
+def read_with(module: str, path: Path) -> tuple[Any, str | None]:
+    """Let a reader read a file, without output of its library and with memory for no more than the file can need.
+
+    Args:
+        module: See `Reader`.
+        path: The file.
+
+    Returns:
+        The reader's result, or None; and the reason for None, which is None, too, if that is the reader's result.
+    """
+    try:
+        with quietly(), bounded(path):
+            return importlib.import_module(f".{module}", __package__).read(path), None
+    except MemoryError:
+        return None, "it asks for more memory than such a file can need"
+    except ModuleNotFoundError as error:
+        return None, f"it needs the package {error.name}: pip install {error.name}"
+    except (Exception, SystemExit) as error:
+        words = "" if isinstance(error, SystemExit) else " ".join(str(error).split())
+        return None, words if words and not isinstance(error, WORDLESS) else f"{type(error).__name__} {words}".strip()
+
+
+def shortened(reason: object) -> str:
+    """A reader's reason in one line."""
+    words = " ".join(str(reason).split()).rstrip(".")
+    return words if len(words) <= LONGEST_REASON else words[: LONGEST_REASON - 4] + " ..."
+
+
+def checked_mesh(mesh: FileMesh, path: Path) -> FileMesh:
+    """The mesh, after a check that its cells only name existing points.
+
+    Raises:
+        InputError: A cell or a set names a point that does not exist.
+    """
+    points = mesh.points
+    for name, nodes in mesh.node_sets.items():
+        if len(nodes) and not 0 <= nodes.min() <= nodes.max() < len(points):
+            raise InputError(f"{path}: the set {name!r} names points that do not exist")
+    for block in mesh.blocks:
+        bad = np.argwhere((block.nodes < 0) | (block.nodes >= len(points)))
+        if len(bad):
+            row, column = bad[0]
+            cell = "tetrahedron" if block.kind == "tetra" else block.kind
+            raise InputError(
+                f"{path}: {cell} {row} names point {block.nodes[row, column]} but the points are 0 to {len(points) - 1}"
+            )
+    return mesh
+
+
+def load_volume(path: str | PathLike[str]) -> LoadedVolume:
+    """Read a scan: .nii, .nii.gz, .mha, .mhd, .nrrd, .nhdr, .vti, an image in a .vtk, or DICOM: a .dcm
+    with several slices, or the largest series in a folder.
+
+    Raises:
+        InputError: The file does not exist, has another format, cannot be read, is not three-dimensional, has more than
+            one number a voxel, or the library for the format is not installed; one line says which.
+    """
+    source = Path(path)
+    if not source.exists():
+        raise InputError(f"{source}: no such file")
+    if suffix_of(source) is None and not source.is_dir():
+        known = ", ".join(SCANS)
+        raise InputError(f"{source}: unknown format {source.suffix or '(no extension)'}; it must be {known}")
+    image = read_mesh_file(source)
+    if not isinstance(image, LoadedVolume):
+        raise InputError(f"{source}: holds a mesh; it must be an image")
+    return volume_of_image(source, image)
+
+
+def volume_of_image(source: Path, image: LoadedVolume) -> LoadedVolume:
+    """The volume of a file's voxels.
+
+    Raises:
+        InputError: See `load_volume`.
+    """
+    values = image.values
+    while values.ndim > 3 and values.shape[-1] == 1:
+        values = values[..., 0]
+    if values.ndim != 3:
+        raise InputError(f"{source}: has shape {values.shape}; it must be a volume [nx, ny, nz] of single numbers")
+    if values.dtype.kind not in "biuf":
+        raise InputError(
+            f"{source}: has voxels of type {values.dtype}, as colours or vectors do; it must be one number"
+        )
+    if not values.size:
+        raise InputError(f"{source}: has no voxels, its shape is {values.shape}")
+    name = source.resolve().name if source.is_dir() else source.name.removesuffix(suffix_of(source) or "")
+    return replace(image, values=values, name=name, source=source)
+
+
+def affine_of(spacing: Any, origin: Any) -> NDArray[np.float64]:
+    """The matrix [4, 4] from voxel indices to positions.
+
+    Raises:
+        InputError: Spacing is not three positive numbers, or origin is not three finite ones.
+    """
+    steps = checked_numbers(spacing, "spacing", "[3]")
+    if steps.shape != (3,) or not all(math.isfinite(s) and s > 0.0 for s in steps):
+        raise InputError(f"spacing is {shown(spacing)}; it must be three positive numbers, one an axis")
+    start = np.zeros(3) if origin is None else checked_vector(origin, "origin")
+    affine = np.diag([*steps, 1.0])
+    affine[:3, 3] = start
+    return affine

@@ -1,4 +1,4 @@
-"""Formats of SimpleITK: MetaImage, NRRD, single DICOM files, and folders with DICOM series."""
+"""Formats of SimpleITK: NIfTI, MetaImage, NRRD, single DICOM files, and folders with DICOM series."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import SimpleITK
 
-from .filemesh import FileImage, Unreadable
+from .filemesh import LoadedVolume, Unreadable
 
 #: ITK uses left-posterior-superior; half a turn about z gives NIfTI's right-anterior-superior.
 RAS_FROM_LPS = np.diag([-1.0, -1.0, 1.0, 1.0])
@@ -23,7 +23,7 @@ UNEVEN = 1.0e-3
 DESCRIPTION, MODALITY, POSITION = "0008|103e", "0008|0060", "0020|0032"
 
 
-def read(path: Path) -> FileImage:
+def read(path: Path) -> LoadedVolume:
     """The voxels of an image; for a folder, those of the largest series in it and its subfolders.
 
     Raises:
@@ -37,6 +37,8 @@ def read(path: Path) -> FileImage:
     except RuntimeError as error:
         # ITK names itself and its source files first; the reason comes last.
         raise Unreadable(re.split(r"(?:sitk::|ITK )ERROR:", str(error))[-1]) from None
+    if path.name.lower().endswith((".nii", ".nii.gz")):
+        return _as_nifti_says(image, _header(str(path)))
     if path.suffix.lower() != ".dcm":
         return image
     if image.values.shape[2] < 2:
@@ -44,7 +46,19 @@ def read(path: Path) -> FileImage:
     return replace(image, unit="mm")
 
 
-def _voxels(image: Any, notes: list[str]) -> FileImage:
+def _as_nifti_says(image: LoadedVolume, header: Any) -> LoadedVolume:
+    """The image of a NIfTI file, whose lengths ITK converts to mm, with the unit and the orientation that it names."""
+    unit, *codes = (int(header.GetMetaData(key)) for key in ("xyzt_units", "qform_code", "sform_code"))
+    image = replace(image, unit="mm" if unit & 7 in (1, 2, 3) else None, notes=[])
+    if any(codes):
+        return image
+    note = "the header gives no orientation: its axes are taken as right, anterior, superior"
+    return replace(image, affine=np.diag([*header.GetSpacing()[:3], 1.0]), notes=[note])
+
+
+def _voxels(image: Any, notes: list[str]) -> LoadedVolume:
+    while image.GetDimension() > 3 and image.GetSize()[-1] == 1:
+        image = image[..., 0]
     dimensions, numbers = image.GetDimension(), image.GetNumberOfComponentsPerPixel()
     if (dimensions, numbers) != (3, 1):
         raise Unreadable(f"it has {dimensions} dimensions and {numbers} numbers a voxel; it must have 3 and 1")
@@ -52,10 +66,10 @@ def _voxels(image: Any, notes: list[str]) -> FileImage:
     affine[:3, :3] = np.array(image.GetDirection()).reshape(3, 3) * image.GetSpacing()
     affine[:3, 3] = image.GetOrigin()
     values = np.asarray(SimpleITK.GetArrayFromImage(image)).transpose(2, 1, 0)
-    return FileImage(values, RAS_FROM_LPS @ affine, [*notes, TURNED])
+    return LoadedVolume(values, RAS_FROM_LPS @ affine, [*notes, TURNED])
 
 
-def _series(folder: Path) -> FileImage:
+def _series(folder: Path) -> LoadedVolume:
     series = _all_series(folder)
     if not series:
         raise Unreadable("it has none; name a file, or a folder with one")

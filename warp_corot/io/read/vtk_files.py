@@ -19,20 +19,9 @@ from vtkmodules.vtkCommonDataModel import (
     vtkUnstructuredGrid,
 )
 from vtkmodules.vtkFiltersCore import vtkAppendFilter, vtkTriangleFilter
+from vtkmodules.vtkFiltersGeneral import vtkDataSetTriangleFilter
 
-from .filemesh import (
-    CORNERS,
-    INTERNAL,
-    Block,
-    FileImage,
-    FileMesh,
-    Unreadable,
-    corners_note,
-    fan,
-    sets_of_numbers,
-    split_polyhedron,
-    whole_numbers,
-)
+from .filemesh import CORNERS, Block, FileMesh, LoadedVolume, Unreadable, corners_note, sets_of_numbers, whole_numbers
 
 #: VTK's cell types by the kind that their corners make; corners come first in cells of any order.
 KINDS = {
@@ -44,16 +33,17 @@ KINDS = {
     "quad": (9, 23, 28, 30, 70, 77),
 }
 LINEAR = {10, 12, 13, 14, 5, 9}
-VOXEL, PIXEL, STRIP, POLYGON, PENTAPRISM, HEXAPRISM, POLYHEDRON = 11, 8, 6, 7, 15, 16, 42
-#: Cells that are split one by one: the name of one and of several.
-MANY_FACED = {
-    PENTAPRISM: ("pentagonal prism", "pentagonal prisms"),
-    HEXAPRISM: ("hexagonal prism", "hexagonal prisms"),
-    POLYHEDRON: ("polyhedron", "polyhedra"),
-}
+VOXEL, PIXEL = 11, 8
+#: Arrays of VTK that number neither regions nor sets of nodes.
+INTERNAL = (
+    *("vtkGhostType", "vtkOriginalCellIds", "vtkOriginalPointIds"),
+    *("GlobalCellIds", "GlobalElementId", "GlobalPointIds", "GlobalNodeId"),
+)
+#: Polygons, strips, prisms with five and six sides and polyhedra, which VTK itself splits, with all cells beside them.
+MANY_FACED = {6: "strips", 7: "polygons", 15: "pentagonal prisms", 16: "hexagonal prisms", 42: "polyhedra"}
 
 
-def read(path: Path) -> FileMesh | FileImage:
+def read(path: Path) -> FileMesh | LoadedVolume:
     """The cells of a file, or the voxels of an image.
 
     Raises:
@@ -128,10 +118,7 @@ def _leaves(data: Any, name: str) -> Iterator[tuple[str, Any]]:
             yield from _leaves(leaf, own or f"block {iterator.GetCurrentFlatIndex()}")
             iterator.GoToNextItem()
     elif isinstance(data, vtkStructuredGrid | vtkRectilinearGrid | vtkImageData):
-        append = vtkAppendFilter()
-        append.AddInputData(data)
-        append.Update()
-        yield name, append.GetOutput()
+        yield name, _filtered(vtkAppendFilter(), data)
     elif isinstance(data, vtkUnstructuredGrid | vtkPolyData) and data.GetNumberOfCells():
         yield name, data
 
@@ -164,19 +151,16 @@ def _joined(leaves: list[tuple[str, Any]]) -> FileMesh:
 def _cells(data: Any, ignored: dict[str, int], notes: list[str]) -> Iterator[Block]:
     if isinstance(data, vtkPolyData):
         # VTK itself triangulates strips and general polygons.
-        filtered = vtkTriangleFilter()
-        filtered.SetInputData(data)
-        filtered.PassLinesOff()
-        filtered.PassVertsOff()
-        filtered.Update()
-        data = filtered.GetOutput()
+        data = _filtered(vtkTriangleFilter(), data, "PassLinesOff", "PassVertsOff")
         triangles = _ints(data.GetPolys().GetConnectivityArray()).reshape(-1, 3)
         yield Block("triangle", triangles, _data(data, np.arange(len(triangles))))
         return
-    array = data.GetCellTypes() if hasattr(data, "GetCellTypes") else None
-    if array is None or not hasattr(array, "GetNumberOfTuples"):
-        array = data.GetCellTypesArray()
-    types = _ints(array)
+    types = _types(data)
+    if found := set(types.tolist()) & MANY_FACED.keys():
+        split = ", ".join(MANY_FACED[number] for number in sorted(found))
+        notes.append(f"{split} are split into tetrahedra or triangles by VTK")
+        data = _filtered(vtkDataSetTriangleFilter(), data)
+        types = _types(data)
     array = data.GetCells()
     offsets, nodes = _ints(array.GetOffsetsArray()), _ints(array.GetConnectivityArray())
     if len(offsets) != len(types) + 1 or (np.diff(offsets) < 0).any() or offsets[-1] > len(nodes):
@@ -185,18 +169,28 @@ def _cells(data: Any, ignored: dict[str, int], notes: list[str]) -> Iterator[Blo
     for number in np.unique(types).tolist():
         cells = np.flatnonzero(types == number)
         kind = {VOXEL: "hexahedron", PIXEL: "quad"}.get(number, kinds.get(number))
-        if kind is not None:
-            yield _corners(kind, number, cells, offsets, nodes, data)
-            if number not in LINEAR | {VOXEL, PIXEL}:
-                notes.append(corners_note(kind, 2 if number < 69 else None))
-        elif number in (STRIP, POLYGON, PENTAPRISM, HEXAPRISM, POLYHEDRON):
-            yield _by_faces(number, cells, data)
-            if number in MANY_FACED:
-                one, more = MANY_FACED[number]
-                some = f"1 {one} is" if len(cells) == 1 else f"{len(cells)} {more} are"
-                notes.append(f"{some} split into tetrahedra")
-        else:
+        if kind is None:
             ignored[f"VTK's type {number}" if number > 4 else "line"] = len(cells)
+            continue
+        yield _corners(kind, number, cells, offsets, nodes, data)
+        if number not in LINEAR | {VOXEL, PIXEL}:
+            notes.append(corners_note(kind, 2 if number < 69 else None))
+
+
+def _filtered(filtering: Any, data: Any, *options: str) -> Any:
+    """The output of a filter of VTK."""
+    for option in options:
+        getattr(filtering, option)()
+    filtering.SetInputData(data)
+    filtering.Update()
+    return filtering.GetOutput()
+
+
+def _types(data: Any) -> NDArray[np.int64]:
+    array = data.GetCellTypes() if hasattr(data, "GetCellTypes") else None
+    if array is None or not hasattr(array, "GetNumberOfTuples"):
+        array = data.GetCellTypesArray()
+    return _ints(array)
 
 
 def _corners(kind: str, number: int, cells: NDArray, offsets: NDArray, nodes: NDArray, data: Any) -> Block:
@@ -210,31 +204,6 @@ def _corners(kind: str, number: int, cells: NDArray, offsets: NDArray, nodes: ND
     elif number == PIXEL:
         corners = corners[:, [0, 1, 3, 2]]
     return Block(kind, corners, _data(data, cells))
-
-
-def _by_faces(number: int, cells: NDArray, data: Any) -> Block:
-    """Cells with many corners one by one, as tetrahedra; strips and polygons as triangles."""
-    made: list[tuple[int, ...]] = []
-    whose: list[int] = []
-    for index in cells.tolist():
-        cell = data.GetCell(index)
-        if number in (STRIP, POLYGON):
-            ids = _corners_of(cell)
-            strip = [(ids[k + k % 2], ids[k + 1 - k % 2], ids[k + 2]) for k in range(len(ids) - 2)]
-            parts: list[tuple[int, ...]] = list(strip if number == STRIP else fan(ids))
-        else:
-            # A cell returns the same face object every time, so its corners are copied at once.
-            faces = [_corners_of(cell.GetFace(k)) for k in range(cell.GetNumberOfFaces())]
-            parts = list(split_polyhedron(faces))
-        made += parts
-        whose += [index] * len(parts)
-    flat = number in (STRIP, POLYGON)
-    nodes = np.array(made, np.int64).reshape(-1, 3 if flat else 4)
-    return Block("triangle" if flat else "tetra", nodes, _data(data, np.array(whose, np.int64)))
-
-
-def _corners_of(cell: Any) -> list[int]:
-    return [cell.GetPointId(k) for k in range(cell.GetNumberOfPoints())]
 
 
 def _data(data: Any, cells: NDArray) -> dict[str, NDArray[np.int64]]:
@@ -265,7 +234,7 @@ def _ints(array: Any) -> NDArray[np.int64]:
         return np.array([array.GetComponent(k, 0) for k in range(array.GetNumberOfTuples())], dtype=np.int64)
 
 
-def _image(grid: Any) -> FileImage:
+def _image(grid: Any) -> LoadedVolume:
     extent = np.array(grid.GetExtent()).reshape(3, 2)
     at_points = grid.GetPointData().GetNumberOfArrays() > 0
     data = grid.GetPointData() if at_points else grid.GetCellData()
@@ -283,4 +252,4 @@ def _image(grid: Any) -> FileImage:
     affine[:3, 3] += affine[:3, :3] @ (extent[:, 0] + (0.0 if at_points else 0.5))
     notes = [] if at_points else ["values belong to cells: voxel centres lie between the grid's points"]
     values = np.array(vtk_to_numpy(array).reshape(tuple(shape), order="F"), order="F")
-    return FileImage(values, affine, notes)
+    return LoadedVolume(values, affine, notes)

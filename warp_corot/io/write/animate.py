@@ -8,6 +8,7 @@ import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field
+from functools import cached_property
 from importlib.metadata import PackageNotFoundError, version
 from os import PathLike
 from pathlib import Path
@@ -22,6 +23,7 @@ from warp_corot.errors import InputError
 from warp_corot.inputs.checks import checked_number, checked_path, shown
 from warp_corot.inputs.simulation_lock import under_lock
 from warp_corot.inputs.stopwatch import WATCH
+from warp_corot.io.pictures.colors import VertexAverage
 from warp_corot.simulation.parts import check_whole
 from warp_corot.simulation.progress import bar_of, hidden
 from warp_corot.simulation.simulation import Simulation
@@ -33,7 +35,7 @@ if TYPE_CHECKING:
     from warp_corot.io.write.usd.prims import Touched
     from warp_corot.io.write.usd.writer import UsdWriter
 
-    from .paraview import Writer
+    from .paraview import ParaViewWriter
     from .skins import Surface
 
 Progress = Callable[[int, int], None]
@@ -69,7 +71,7 @@ class Recording:
     final_displacement: float = 0.0
 
 
-class _Joined:
+class JoinedBodies:
     """The bodies of a simulation in one world as one mesh and one material, body after body."""
 
     def __init__(self, sim: Simulation, world: int):
@@ -102,8 +104,27 @@ class _Joined:
         """Whether bodies are drawn by their tetrahedra."""
         return surface is None and not labels and not any(map(has_domain, self.meshes))
 
+    @cached_property
+    def average(self) -> VertexAverage:
+        """The average from tetrahedra to nodes."""
+        return VertexAverage.of(self)
+
+    @property
+    def moduli(self) -> tuple[Any, Any]:
+        """Young's modulus [Pa] and Poisson's ratio, numbers or [T]."""
+        return self.young, self.poisson  # type: ignore[attr-defined]
+
+    def nodal(self, name: str) -> npt.NDArray[Any]:
+        """An array of the bodies with a row for each node, by its name."""
+        return np.concatenate([getattr(world, name).numpy() for world in self.worlds])
+
+    def von_mises(self, sim: Simulation) -> npt.NDArray[np.float32]:
+        """Von Mises stress of all tetrahedra [Pa], [T]."""
+        return np.concatenate([sim.von_mises(world.body)[world.elements] for world in self.worlds])
+
     def _join(self) -> None:
         self._revisions = [world.body.version for world in self.worlds]
+        vars(self).pop("average", None)
         meshes = self.meshes
         offsets = np.cumsum([0, *(len(mesh.points) for mesh in meshes)])
         self.points = np.concatenate([mesh.points for mesh in meshes])
@@ -214,8 +235,8 @@ def record(
             materials; parts without materials and colours show the stress.
         tets: Whether to write the TetMesh prim; None: only without a smooth surface.
         labels: Draw each label of the mesh as a separate closed surface, in place of one around all.
-        also: Files for ParaView with displacement, velocity, strain and stress: .pvd or .xdmf with all frames, .vtu
-            with the last one.
+        also: Files for ParaView with displacement, velocity, strain and stress: .pvd with all frames, .vtu with the
+            last one.
         progress: Called with the number of finished frames and of all frames after each; None: terminals show a bar
             after two seconds.
         recording: Filled during the run, so that it is available if the run ends early.
@@ -233,7 +254,7 @@ def record(
     """
     from warp_corot.io.write.usd.writer import UsdWriter
 
-    from . import also_writer, fields_of
+    from .paraview import ParaViewWriter, frame_of
 
     if not isinstance(sim, Simulation):
         raise InputError(f"sim is {shown(sim)}; it must be a Simulation, for example Simulation(body)")
@@ -241,10 +262,10 @@ def record(
     count = 0 if duration is None else frame_count(duration, fps)
     for body in sim.bodies:
         check_whole(body)
-    others = [also_writer(Path(other)) for other in also if sim.is_root]
+    others = [ParaViewWriter(Path(other)) for other in also if sim.is_root]
     if world is None and sim.worlds > 1:
         raise InputError(f"the simulation has {sim.worlds} worlds; choose the one to draw, for example world=0")
-    joined = _Joined(sim, world or 0)
+    joined = JoinedBodies(sim, world or 0)
     skins = joined.skins(surface, tets, labels)
     writer: Any = _Unwritten(Path(path))
     if sim.is_root:
@@ -273,9 +294,9 @@ def record(
         writer.about = {**told, **steps_made(sim)}
         _write_frame(writer, sim, joined, done)
         if also:
-            fields = fields_of(sim, joined.worlds, sim.total_time - first_time)
+            shown_mesh = frame_of(sim, joined)
             for other in others:
-                other.write(fields)
+                other.write(sim.total_time - first_time, shown_mesh)
 
     with closed_whole(writer, done, others), progress_bar(count, wanted=progress is None) as bar:
         make_frames(sim, fps, count, done, write, progress or bar)
@@ -320,25 +341,22 @@ def progress_bar(count: int, *, wanted: bool = True) -> Iterator[Progress]:
 
 
 @under_lock
-def _write_frame(writer: UsdWriter, sim: Simulation, joined: _Joined, done: Recording) -> None:
-    positions = [w.positions.numpy() for w in joined.worlds]
-    velocities = [w.velocities.numpy() for w in joined.worlds]
-    stresses = [sim.von_mises(w.body)[w.elements] for w in joined.worlds]
+def _write_frame(writer: UsdWriter, sim: Simulation, joined: JoinedBodies, done: Recording) -> None:
     writer.write(
-        np.concatenate(positions),
-        velocities=np.concatenate(velocities),
-        von_mises=np.concatenate(stresses),
+        joined.nodal("positions"),
+        velocities=joined.nodal("velocities"),
+        von_mises=joined.von_mises(sim),
         touched=_touched(sim, joined),
     )
     done.frames = writer.frames
     done.elements.append(len(joined.tets))
     # In float64: before a state becomes infinite, squares overflow float32.
-    lengths = [np.linalg.norm(w.displacements.numpy().astype(np.float64), axis=1).max() for w in joined.worlds]
-    done.final_displacement = float(max(lengths))
+    lengths = np.linalg.norm(joined.nodal("displacements").astype(np.float64), axis=1)
+    done.final_displacement = float(lengths.max())
     done.largest_displacement = max(done.largest_displacement, done.final_displacement)
 
 
-def _touched(sim: Simulation, joined: _Joined) -> Touched | None:
+def _touched(sim: Simulation, joined: JoinedBodies) -> Touched | None:
     """Contact on the drawn bodies, if there is any in the simulation."""
     from warp_corot.io.write.usd.prims import Touched
 
@@ -350,7 +368,7 @@ def _touched(sim: Simulation, joined: _Joined) -> Touched | None:
 
 
 @contextmanager
-def closed_whole(writer: ColoredStage, done: Recording, others: Sequence[Writer] = ()) -> Iterator[None]:
+def closed_whole(writer: ColoredStage, done: Recording, others: Sequence[ParaViewWriter] = ()) -> Iterator[None]:
     """Close the writers at the end in any case, with signals delayed and the time measured."""
     try:
         yield

@@ -1,4 +1,4 @@
-"""Surfaces, bound to a body's nodes, that are drawn in place of the boundary of its tetrahedra."""
+"""Surfaces that are drawn: of bodies, bound to their nodes, and of rigid obstacles."""
 
 from __future__ import annotations
 
@@ -10,6 +10,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
+from warp_corot.contact.shapes import Box, Capsule, Cylinder, Ground, Shape, Sphere, TriangleMesh
+from warp_corot.contact.tool import Obstacle, Tool
+from warp_corot.cutting.blade import Edge
 from warp_corot.domain.closing import turned_inwards
 from warp_corot.errors import InputError
 from warp_corot.mesh.surfaces.bodies import boundary_surface
@@ -18,8 +21,8 @@ from warp_corot.mesh.surfaces.bound import SurfaceMesh
 if TYPE_CHECKING:
     from typing import TypeAlias
 
-    from warp_corot.io.read.surfaces import LoadedSurface
-    from warp_corot.io.read.usd.look import Look
+    from warp_corot.io.read.meshes import LoadedMesh
+    from warp_corot.io.read.usd.meshes import Look
 
     Surface: TypeAlias = "SurfaceMesh | OwnSurface | str | PathLike[str]"
 
@@ -43,7 +46,7 @@ class OwnSurface:
     def of_domain(
         cls,
         path: str | PathLike[str],
-        loaded: LoadedSurface,
+        loaded: LoadedMesh,
         bounds: npt.ArrayLike,
         offset: npt.ArrayLike = (0.0, 0.0, 0.0),
     ) -> OwnSurface | None:
@@ -59,9 +62,9 @@ class OwnSurface:
         Raises:
             InputError: See `look.read_looks`.
         """
-        from warp_corot.io.read.usd.look import has_looks, look_of_triangles, read_looks
+        from warp_corot.io.read.usd.meshes import has_looks, look_of_triangles, read_looks
 
-        looks = read_looks(path) if has_looks(path) else [look_of_triangles(path, loaded.points, loaded.triangles)]
+        looks = read_looks(path) if has_looks(path) else [look_of_triangles(path, loaded.points, loaded.cells)]
         moved = np.asarray(offset, dtype=np.float64)
         given = np.asarray(bounds, dtype=np.float64) - moved
         length = float(np.ptp(given, axis=0).max())
@@ -198,7 +201,7 @@ def _skins_of_one(mesh: Any, surface: Any, labels: bool) -> list[Skin]:
     if isinstance(surface, OwnSurface):
         return _bound_looks(mesh, surface.looks)
     if isinstance(surface, str | PathLike):
-        from warp_corot.io.read.usd.look import read_looks
+        from warp_corot.io.read.usd.meshes import read_looks
 
         return _bound_looks(mesh, _outwards(read_looks(surface)))
     if surface is not None:
@@ -290,3 +293,93 @@ def joined_surfaces(parts: Sequence[SurfaceMesh]) -> SurfaceMesh:
         np.concatenate(triangles).astype(np.int32),
         is_cut=np.concatenate([part.of_cut for part in parts]),
     )
+
+
+#: Points around a round shape.
+AROUND = 32
+#: Height of a drawn blade over the length of its edge.
+BLADE_HEIGHT = 0.15
+#: Half of the edge of a drawn ground, in sizes of the bodies on it.
+GROUND_SIZE = 1.2
+
+Floats = npt.NDArray[np.float64]
+Ints = npt.NDArray[np.int32]
+
+
+@dataclass(frozen=True)
+class Solid:
+    """A surface in an obstacle's frame.
+
+    Attributes:
+        points: [m], [N, 3].
+        triangles: Counter-clockwise seen from outside, int32 [F, 3].
+    """
+
+    points: Floats
+    triangles: Ints
+
+    def at(self, pose: npt.ArrayLike) -> Floats:
+        """The points at a pose [m], [N, 3]: position and quaternion (x, y, z, w)."""
+        place = np.asarray(pose, dtype=np.float64)
+        return _rotation(place[3:]).apply(self.points) + place[:3]
+
+
+def shape_of(obstacle: Obstacle) -> Shape:
+    return obstacle.shape if isinstance(obstacle, Tool) else obstacle
+
+
+def solid_of(shape: Shape) -> Solid | None:
+    """The surface of a shape; None for a ground, which has no end, and for a signed distance."""
+    if isinstance(shape, TriangleMesh):
+        return Solid(np.asarray(shape.points, dtype=np.float64), np.asarray(shape.triangles, dtype=np.int32))
+    if isinstance(shape, Edge):
+        return _sheet(shape.points)
+    if not isinstance(shape, Box | Sphere | Capsule | Cylinder):
+        return None
+    from trimesh import creation  # takes longer than ``import warp_corot``
+
+    radius, half, _ = shape.size
+    if isinstance(shape, Box):
+        made = creation.box(extents=2.0 * np.array(shape.size))
+    elif isinstance(shape, Sphere):
+        made = creation.uv_sphere(radius=radius, count=[AROUND // 2 + 1, AROUND])
+    elif isinstance(shape, Capsule):
+        made = creation.capsule(radius=radius, height=2.0 * half, count=[AROUND // 2 + 1, AROUND])
+    else:
+        made = creation.cylinder(radius=radius, height=2.0 * half, sections=AROUND)
+    return Solid(np.asarray(made.vertices, np.float64), np.asarray(made.faces, np.int32))
+
+
+def ground_corners(ground: Ground, points: npt.ArrayLike) -> Floats:
+    """A square of the ground below points [m], [4, 3], counter-clockwise seen from above."""
+    x = np.asarray(points, dtype=np.float64)
+    turn = _rotation(ground.quaternion)
+    above = turn.inv().apply(x - ground.position)
+    low, high = above.min(axis=0), above.max(axis=0)
+    # A body that is higher than wide may fall over.
+    center, half = 0.5 * (low + high)[:2], GROUND_SIZE * 0.5 * float((high - low).max())
+    corners = np.array([(-half, -half, 0.0), (half, -half, 0.0), (half, half, 0.0), (-half, half, 0.0)])
+    return turn.apply(corners + np.array([*center, 0.0])) + ground.position
+
+
+def poses_of(obstacles: Sequence[Obstacle], world: int = 0) -> Floats:
+    """Where obstacles of a simulation are, float64 [O, 7]; waits for the device."""
+    poses = [each.present_pose[world] if isinstance(each, Tool) else each.pose for each in obstacles]
+    return np.array(poses, dtype=np.float64).reshape(-1, 7)
+
+
+def _sheet(edge: Floats) -> Solid:
+    """Both sides of a sheet behind a polyline [n, 3]."""
+    along = edge[-1] - edge[0]
+    aside = np.eye(3)[np.argmin(np.abs(along))]
+    back = BLADE_HEIGHT * np.cross(np.cross(along, aside), along) / max(float(np.linalg.norm(along)), 1e-30)
+    a, n = np.arange(len(edge) - 1), len(edge)
+    front = np.concatenate([np.stack([a, a + 1, a + n + 1], axis=1), np.stack([a, a + n + 1, a + n], axis=1)])
+    return Solid(np.concatenate([edge, edge + back]), np.concatenate([front, front[:, ::-1]]).astype(np.int32))
+
+
+def _rotation(quaternion: npt.ArrayLike) -> Any:
+    """SciPy's ``Rotation`` of a quaternion (x, y, z, w)."""
+    from scipy.spatial.transform import Rotation  # takes a sixth of the time of ``import warp_corot``
+
+    return Rotation.from_quat(quaternion)

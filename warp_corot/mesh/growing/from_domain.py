@@ -17,8 +17,7 @@ import numpy as np
 import warp as wp
 
 from warp_corot.errors import InputError
-from warp_corot.inputs.checks import checked_count, checked_number, shown
-from warp_corot.inputs.device import checked_device
+from warp_corot.inputs.checks import checked_count, checked_device, checked_number, shown
 from warp_corot.inputs.loading import MESHING, load
 from warp_corot.mesh.forest import TetForest
 from warp_corot.mesh.growing.fine_classification import Coarsening, Resolved

@@ -14,7 +14,7 @@ import warp as wp
 from scipy.spatial.transform import Rotation
 
 from warp_corot.errors import InputError, UnstableError
-from warp_corot.inputs.device import checked_device
+from warp_corot.inputs.checks import checked_device
 from warp_corot.io.read.usd.scene import open_scene
 from warp_corot.io.write.animate import steps_per_frame
 from warp_corot.io.write.usd.over import SceneState, SceneWriter

@@ -22,7 +22,7 @@ from warp_corot.elasticity.corotated.fields import CorotatedGeneralField, Subtre
 from warp_corot.elasticity.dilatation import law_of
 from warp_corot.kernels.math.rotation import quick_rotation
 from warp_corot.kernels.stepping.patches import Exchange, Layout, PatchBody, step_patches
-from warp_corot.materials.directional import Directional
+from warp_corot.materials.anisotropic import Directional
 
 if TYPE_CHECKING:
     from warp_corot.body.soft_body import SoftBody

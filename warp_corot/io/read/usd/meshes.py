@@ -1,65 +1,31 @@
-"""Mesh and TetMesh prims of USD stages: triangles in the world, and tetrahedra."""
+"""Mesh and TetMesh prims of USD stages: triangles in the world, tetrahedra, and surfaces with their appearance."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from os import PathLike
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pxr import Usd, UsdGeom
+from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdShade, Vt
 
 from warp_corot.errors import InputError
-from warp_corot.io.files.usd import first_value, in_world, metres_per_unit, open_stage, reads_stage, world_matrix
+from warp_corot.io.files.usd import (
+    first_value,
+    free_name,
+    in_world,
+    metres_per_unit,
+    open_stage,
+    reads_stage,
+    world_matrix,
+)
 from warp_corot.io.read.filemesh import Block, FileMesh, joined_triangles, sets_of_numbers
+from warp_corot.io.read.meshes import UP_AXES, USD_SUFFIXES, placed_meshes
 
 # --- surfaces --------------------------------------------------------------------------------------------------------
-
-
-class DrawnMesh(NamedTuple):
-    """A visible Mesh prim at its first time.
-
-    Attributes:
-        mesh: The prim, a `UsdGeom.Mesh`.
-        points: Points in the world, in the stage's unit, float64 [N, 3].
-        triangles: Fans of its faces without holes, int64 [T, 3], counter-clockwise seen from outside.
-        faces: The face of each triangle, int64 [T].
-        left_handed: Whether the listed faces have the other orientation in the world.
-        smooth: Whether it is a subdivision surface.
-    """
-
-    mesh: Any
-    points: NDArray[np.float64]
-    triangles: NDArray[np.int64]
-    faces: NDArray[np.int64]
-    left_handed: bool
-    smooth: bool
-
-
-def drawn_meshes(stage: Any, path: Path) -> Iterator[DrawnMesh]:
-    """The visible Mesh prims with faces, instances included.
-
-    Raises:
-        InputError: Faces that do not match their points.
-    """
-    for prim in stage.Traverse(Usd.TraverseInstanceProxies()):
-        mesh = UsdGeom.Mesh(prim)
-        if not mesh or mesh.ComputePurpose() in ("guide", "proxy"):
-            continue
-        points, triangles, faces = _triangles(mesh, path)
-        if not len(triangles):
-            continue
-        left_handed = mesh.GetOrientationAttr().Get() == UsdGeom.Tokens.leftHanded
-        left_handed ^= bool(np.linalg.det(world_matrix(prim)[:3, :3]) < 0.0)
-        yield DrawnMesh(
-            mesh,
-            in_world(prim, points),
-            triangles[:, ::-1] if left_handed else triangles,
-            faces,
-            left_handed,
-            mesh.GetSubdivisionSchemeAttr().Get() != UsdGeom.Tokens.none,
-        )
 
 
 @reads_stage
@@ -70,11 +36,10 @@ def read_usd_surface(path: Path) -> FileMesh:
         InputError: The file is not a stage, or a damaged one.
     """
     stage = open_stage(path)
-    drawn = list(drawn_meshes(stage, path))
-    smooth = [each.mesh.GetPath() for each in drawn if each.smooth]
+    looks = list(looks_of(stage, path, 1.0))
     return joined_triangles(
-        [(each.mesh.GetPrim().GetName(), each.points, each.triangles) for each in drawn],
-        notes=[f"{name} is a subdivision surface; its control mesh is used" for name in smooth],
+        [(look.name, look.points, look.triangles) for look in looks],
+        notes=[f"{look.path} is a subdivision surface; its control mesh is used" for look in looks if look.smooth],
         metres=metres_per_unit(stage, path),
         up_axis=str(UsdGeom.GetStageUpAxis(stage)),
     )
@@ -198,3 +163,331 @@ def _rest_points(prim, path: Path) -> NDArray[np.float64]:
         if rest_value is not None and len(rest_value) == len(value):
             value = rest_value
     return np.asarray(value, dtype=np.float64).reshape(-1, 3)
+
+
+#: Properties that frames give, or that become invalid when a prim's points are in world coordinates.
+STALE = ("points", "extent", "normals", "velocities", "accelerations", "primvars:normals", "tetraIndices")
+#: Properties that a simulation wrote: the stress, which the colours show, and contact.
+STRESS = "primvars:vonMises"
+COLORS = (STRESS, "primvars:displayColor", "primvars:displayColor:indices", "primvars:contactPressure")
+#: Bindings are made again; if there are several, the first of these purposes is used.
+PURPOSES = (UsdShade.Tokens.allPurpose, UsdShade.Tokens.preview, UsdShade.Tokens.full)
+
+
+@dataclass(frozen=True, eq=False)
+class Look:
+    """A Mesh prim of a stage.
+
+    Attributes:
+        name: Name of the prim.
+        path: Path of the prim.
+        source: The file.
+        points: Points in the world [m], float64 [V, 3].
+        triangles: Fans of its faces, int32 [F, 3], counter-clockwise seen from outside.
+        faces: The listed face of each triangle, int64 [F].
+        turned: Whether that face is listed clockwise seen from outside, bool [F].
+        is_open: Whether it has holes, through which one sees its inside.
+        had_normals: Whether the prim gives normals.
+        smooth: Whether it is a subdivision surface, which needs no normals.
+        is_plain: Whether it has neither a material nor its own colours, so that stress may colour it.
+    """
+
+    name: str
+    path: str
+    source: Path
+    points: NDArray[np.float64]
+    triangles: NDArray[np.int32]
+    faces: NDArray[np.int64]
+    turned: NDArray[np.bool_]
+    is_open: bool
+    had_normals: bool
+    smooth: bool
+    is_plain: bool
+    _stage: Any
+
+    def placed(self, scale: float, offset: NDArray[np.float64]) -> Look:
+        """The same look with its points scaled by a factor and then moved."""
+        return replace(self, points=scale * self.points + offset)
+
+    def wound(self, turned: NDArray[np.bool_], is_open: bool) -> Look:
+        """The same look with some triangles [F] turned round."""
+        triangles = np.where(turned[:, None], self.triangles[:, ::-1], self.triangles)
+        return replace(self, triangles=triangles, turned=self.turned ^ turned, is_open=is_open)
+
+    def copy_to(self, layer: Sdf.Layer, target: str, materials: str) -> None:
+        """Copy the prim, without points, normals and transform, to a path of a layer, and the materials of the prim and
+        its subsets to another path.
+
+        Textures get absolute paths, so that they are found from the layer's file.
+        """
+        flat = self._stage.GetRootLayer()
+        Sdf.CreatePrimInLayer(layer, Sdf.Path(target).GetParentPath())
+        Sdf.CopySpec(flat, self.path, layer, target)
+        spec = layer.GetPrimAtPath(target)
+        for child in list(spec.nameChildren):
+            if child.typeName != "GeomSubset":
+                del spec.nameChildren[child.name]
+        _without_stale(spec)
+        self._wind(layer, target)
+        bound = [(self.path, target)]
+        bound += [(f"{self.path}/{child.name}", f"{target}/{child.name}") for child in spec.nameChildren]
+        for here, there in bound:
+            self._bind_material(layer, here, there, materials)
+
+    def _wind(self, layer: Sdf.Layer, target: str) -> None:
+        """List the corners of each face of a copy counter-clockwise seen from outside, with their primvars."""
+        stage = Usd.Stage.Open(layer)
+        mesh = UsdGeom.Mesh.Get(stage, target)
+        mesh.CreateOrientationAttr(UsdGeom.Tokens.rightHanded)
+        if self.is_open:
+            mesh.CreateDoubleSidedAttr(True)
+        if not self.turned.any():
+            return
+        counts = np.asarray(mesh.GetFaceVertexCountsAttr().Get())
+        face = np.repeat(np.arange(len(counts)), counts)
+        first = (np.cumsum(counts) - counts)[face]
+        place = np.arange(len(face)) - first
+        order = first + np.where(np.isin(face, self.faces[self.turned]), -place % counts[face], place)
+        corners = mesh.GetFaceVertexIndicesAttr()
+        corners.Set(Vt.IntArray.FromNumpy(np.asarray(corners.Get())[order]))
+        for primvar in UsdGeom.PrimvarsAPI(mesh).GetPrimvars():
+            if primvar.GetInterpolation() == UsdGeom.Tokens.faceVarying:
+                indices = np.asarray(primvar.GetIndices()) if primvar.IsIndexed() else np.arange(len(order))
+                primvar.SetIndices(Vt.IntArray.FromNumpy(indices[order].astype(np.int32)))
+
+    def _bind_material(self, layer: Sdf.Layer, here: str, there: str, materials: str) -> None:
+        """Bind a prim of the layer to a copy of its original's material."""
+        spec = layer.GetPrimAtPath(there)
+        for name in [p.name for p in spec.properties if p.name.startswith("material:binding")]:
+            spec.RemoveProperty(spec.properties[name])
+        binding = UsdShade.MaterialBindingAPI(self._stage.GetPrimAtPath(here))
+        found = (binding.ComputeBoundMaterial(purpose)[0] for purpose in PURPOSES)
+        material = next((material for material in found if material), None)
+        if material is None:
+            return
+        origin = material.GetPath()
+        copied = f"{materials}/{origin.pathString.strip('/').replace('/', '_')}"
+        if not layer.GetPrimAtPath(copied):
+            Sdf.CreatePrimInLayer(layer, materials).typeName = "Scope"
+            layer.GetPrimAtPath(materials).specifier = Sdf.SpecifierDef
+            Sdf.CopySpec(self._stage.GetRootLayer(), origin, layer, copied)
+        stage = Usd.Stage.Open(layer)
+        UsdShade.MaterialBindingAPI.Apply(stage.GetPrimAtPath(there)).Bind(UsdShade.Material.Get(stage, copied))
+
+
+def has_looks(path: str | PathLike[str]) -> bool:
+    """Whether files with this extension describe the appearance of surfaces."""
+    return Path(path).suffix.lower() in (*USD_SUFFIXES, *UP_AXES)
+
+
+def look_of_triangles(path: str | PathLike[str], points: NDArray[Any], triangles: NDArray[Any]) -> Look:
+    """The triangles of a file as a prim with the file's name."""
+    source = Path(path)
+    (look,) = looks_of(stage_of_triangles(source.stem, points, triangles), source, 1.0)
+    return look
+
+
+def read_looks(path: str | PathLike[str]) -> list[Look]:
+    """All visible Mesh prims of a stage, at its first time, or the parts of another surface file in the same form.
+
+    Raises:
+        InputError: The file does not exist, is not a USD stage or another surface file, is damaged, or has no faces.
+    """
+    source = Path(path)
+    if source.suffix.lower() not in (*USD_SUFFIXES, *UP_AXES):
+        known = ", ".join((*USD_SUFFIXES, *UP_AXES))
+        raise InputError(f"{source}: extension {source.suffix or '(none)'}; it must be {known}")
+    if not source.is_file():
+        raise InputError(f"{source}: no such file")
+    if source.suffix.lower() in UP_AXES:
+        stage, metres = stage_of_file(source), 1.0
+    else:
+        stage = _flattened(open_stage(source))
+        metres = metres_per_unit(stage, source)
+    looks = list(looks_of(stage, source, metres))
+    if not looks:
+        raise InputError(f"{source}: has no Mesh prim with faces")
+    return looks
+
+
+def looks_of(stage: Any, source: Path, metres: float) -> Iterator[Look]:
+    """The visible Mesh prims with faces at their first time, instances included; a unit has so many metres.
+
+    Raises:
+        InputError: Faces that do not match their points.
+    """
+    for prim in stage.Traverse(Usd.TraverseInstanceProxies()):
+        mesh = UsdGeom.Mesh(prim)
+        if not mesh or mesh.ComputePurpose() in ("guide", "proxy"):
+            continue
+        points, triangles, faces = _triangles(mesh, source)
+        if not len(triangles):
+            continue
+        left_handed = mesh.GetOrientationAttr().Get() == UsdGeom.Tokens.leftHanded
+        left_handed ^= bool(np.linalg.det(world_matrix(prim)[:3, :3]) < 0.0)
+        normals = mesh.GetNormalsAttr().HasAuthoredValue() or prim.GetAttribute("primvars:normals").HasValue()
+        yield Look(
+            prim.GetName(),
+            str(prim.GetPath()),
+            source,
+            metres * in_world(prim, points),
+            (triangles[:, ::-1] if left_handed else triangles).astype(np.int32),
+            faces,
+            np.full(len(triangles), left_handed),
+            False,
+            bool(normals),
+            mesh.GetSubdivisionSchemeAttr().Get() != UsdGeom.Tokens.none,
+            _is_plain(prim),
+            stage,
+        )
+
+
+def _is_plain(prim: Any) -> bool:
+    parts = [prim, *(child for child in prim.GetChildren() if child.IsA(UsdGeom.Subset))]
+    bound = any(
+        UsdShade.MaterialBindingAPI(part).ComputeBoundMaterial(purpose)[0] for part in parts for purpose in PURPOSES
+    )
+    own_colors = UsdGeom.Mesh(prim).GetDisplayColorAttr().HasAuthoredValue() and not prim.HasAttribute(STRESS)
+    return not bound and not own_colors
+
+
+def _flattened(stage: Any) -> Any:
+    """The stage as one layer, without instances."""
+    stage.SetEditTarget(stage.GetSessionLayer())
+    while instances := [prim for prim in stage.Traverse() if prim.IsInstance()]:
+        for prim in instances:
+            prim.SetInstanceable(False)
+    return Usd.Stage.Open(stage.Flatten())
+
+
+def _without_stale(spec: Any) -> None:
+    """Remove from a Mesh prim what frames will give, what moves, and transforms; keep the first values of the rest."""
+    stale = (*STALE, *(COLORS if STRESS in spec.attributes else ()))
+    for attribute in list(spec.attributes):
+        samples = spec.layer.ListTimeSamplesForPath(attribute.path)
+        if samples:
+            attribute.default = spec.layer.QueryTimeSample(attribute.path, samples[0])
+            for time in samples:
+                spec.layer.EraseTimeSample(attribute.path, time)
+        moved = attribute.name in stale or attribute.name.startswith("xformOp")
+        if moved or not attribute.HasInfo("default"):
+            spec.RemoveProperty(attribute)
+
+
+# --- surface files read by trimesh as stages in memory, a Mesh prim for each part ------------------------------------
+
+#: Path of the prims.
+ROOT = "/scene"
+
+
+def stage_of_file(path: Path) -> Any:
+    """A stage, in metres, of the file's parts, placed by its scene, in the file's coordinates.
+
+    Parts keep their names, texture coordinates (``st``) and colours; a part with a colour or with a texture in a
+    separate file is bound to a `UsdPreviewSurface`.
+
+    Raises:
+        InputError: trimesh cannot read it.
+    """
+    stage = Usd.Stage.CreateInMemory()
+    UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+    UsdGeom.Scope.Define(stage, ROOT)
+    taken: set[str] = set()
+    for geometry, matrix, _, name in placed_meshes(path, maintain_order=True):
+        if len(geometry.faces):
+            _define(stage, _free_name(name or path.stem, taken), geometry, matrix, path)
+    return stage
+
+
+def stage_of_triangles(name: str, points: np.ndarray, triangles: np.ndarray) -> Any:
+    """A stage in metres with one Mesh prim."""
+    stage = Usd.Stage.CreateInMemory()
+    UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+    mesh = UsdGeom.Mesh.Define(stage, f"{ROOT}/{Tf.MakeValidIdentifier(name)}")
+    _set_triangles(mesh, np.asarray(points), np.asarray(triangles))
+    mesh.CreateNormalsAttr(Vt.Vec3fArray(len(points)))
+    mesh.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
+    return stage
+
+
+def _set_triangles(mesh: Any, points: np.ndarray, triangles: np.ndarray) -> None:
+    mesh.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(points, np.float32)))
+    mesh.CreateFaceVertexCountsAttr(Vt.IntArray(len(triangles), 3))
+    mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(np.ascontiguousarray(triangles, np.int32).ravel()))
+    mesh.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
+
+
+def _free_name(name: str, taken: set[str]) -> str:
+    stem = Path(name).stem if Path(name).suffix.lower() in (".obj", ".stl", ".ply", ".off") else name
+    return free_name(Tf.MakeValidIdentifier(stem), taken)
+
+
+def _define(stage: Any, name: str, geometry: Any, matrix: np.ndarray, source: Path) -> None:
+    mesh = UsdGeom.Mesh.Define(stage, f"{ROOT}/{name}")
+    points = np.asarray(geometry.vertices, np.float64) @ matrix[:3, :3].T + matrix[:3, 3]
+    faces = np.asarray(geometry.faces, np.int32)
+    if np.linalg.det(matrix[:3, :3]) < 0:
+        faces = faces[:, ::-1]
+    _set_triangles(mesh, points, faces)
+    normals = np.asarray(geometry.vertex_normals, np.float32) @ np.linalg.inv(matrix[:3, :3]).astype(np.float32)
+    mesh.CreateNormalsAttr(Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(normals, np.float32)))
+    mesh.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
+    visual, primvars = geometry.visual, UsdGeom.PrimvarsAPI(mesh)
+    uv = getattr(visual, "uv", None)
+    if uv is not None and len(uv) == len(points):
+        kind = Sdf.ValueTypeNames.TexCoord2fArray
+        st = primvars.CreatePrimvar("st", kind, UsdGeom.Tokens.vertex)
+        st.Set(Vt.Vec2fArray.FromNumpy(np.asarray(uv, np.float32)))
+    if visual.kind == "vertex":
+        colors = np.asarray(visual.vertex_colors[:, :3], np.float32) / 255.0
+        primvar = mesh.CreateDisplayColorPrimvar(UsdGeom.Tokens.vertex)
+        primvar.Set(Vt.Vec3fArray.FromNumpy(_linear(colors)))
+    elif visual.kind == "face":
+        colors = np.asarray(visual.face_colors[:, :3], np.float32) / 255.0
+        mesh.CreateDisplayColorPrimvar(UsdGeom.Tokens.uniform).Set(Vt.Vec3fArray.FromNumpy(_linear(colors)))
+    elif visual.kind == "texture" and visual.defined and visual.material is not None:
+        _bind_material(stage, mesh, visual.material, source)
+
+
+def _bind_material(stage: Any, mesh: Any, material: Any, source: Path) -> None:
+    name = Tf.MakeValidIdentifier(getattr(material, "name", None) or f"{mesh.GetPrim().GetName()}_material")
+    path = f"{ROOT}/materials/{name}"
+    if not stage.GetPrimAtPath(path):
+        bound = UsdShade.Material.Define(stage, path)
+        shader = UsdShade.Shader.Define(stage, f"{path}/surface")
+        shader.CreateIdAttr("UsdPreviewSurface")
+        color = np.asarray(material.main_color, np.float32)[:3] / 255.0
+        diffuse = shader.CreateInput("diffuseColor", Sdf.ValueTypeNames.Color3f)
+        diffuse.Set(Gf.Vec3f(*map(float, _linear(color))))
+        texture = _texture_file(material, source)
+        if texture is not None:
+            reader = UsdShade.Shader.Define(stage, f"{path}/st")
+            reader.CreateIdAttr("UsdPrimvarReader_float2")
+            reader.CreateInput("varname", Sdf.ValueTypeNames.String).Set("st")
+            image = UsdShade.Shader.Define(stage, f"{path}/texture")
+            image.CreateIdAttr("UsdUVTexture")
+            image.CreateInput("file", Sdf.ValueTypeNames.Asset).Set(Sdf.AssetPath(str(texture)))
+            image.CreateInput("st", Sdf.ValueTypeNames.Float2).ConnectToSource(
+                reader.CreateOutput("result", Sdf.ValueTypeNames.Float2)
+            )
+            diffuse.ConnectToSource(image.CreateOutput("rgb", Sdf.ValueTypeNames.Float3))
+        bound.CreateSurfaceOutput().ConnectToSource(shader.CreateOutput("surface", Sdf.ValueTypeNames.Token))
+    UsdShade.MaterialBindingAPI.Apply(mesh.GetPrim()).Bind(UsdShade.Material.Get(stage, path))
+
+
+def _texture_file(material: Any, source: Path) -> Path | None:
+    """The picture of a material, if it is a file beside the surface's."""
+    named = (getattr(material, "kwargs", None) or {}).get("map_kd")
+    image = getattr(material, "image", None)
+    for name in (named, getattr(image, "filename", None)):
+        if isinstance(name, list):
+            name = " ".join(name)
+        if name and (source.parent / str(name)).is_file():
+            return (source.parent / str(name)).resolve()
+    return None
+
+
+def _linear(srgb: np.ndarray) -> np.ndarray:
+    from warp_corot.io.pictures.colors import srgb_to_linear
+
+    return np.asarray(srgb_to_linear(srgb), np.float32)

@@ -16,7 +16,7 @@ from pxr import Tf, Usd, UsdGeom, UsdPhysics, UsdShade
 from warp_corot.errors import InputError
 from warp_corot.io.files.quiet import quietly
 from warp_corot.io.files.usd import metres_per_unit, open_stage, reads_stage, world_matrix
-from warp_corot.io.read.tetrahedra import USD_SUFFIXES
+from warp_corot.io.read.meshes import USD_SUFFIXES
 from warp_corot.mesh.topology import signed_volumes
 
 # --- physics that Newton's importer does not report: values that the file gives, and gravity -------------------------

@@ -13,10 +13,10 @@ from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdShade, Vt
 
 from warp_corot.errors import InputError
 from warp_corot.io.files.usd import reason, usd_name
-from warp_corot.io.files.whole import sync
+from warp_corot.io.files.whole import written_whole
 from warp_corot.io.pictures.colors import VertexAverage, color_index
 from warp_corot.io.read.usd.scene import Scene, TetPrim
-from warp_corot.mesh.topology import boundary_faces, signed_volumes
+from warp_corot.mesh.topology import boundary_faces
 
 from .pieces import ColoredStage, Samples
 from .prims import declare_moving, declare_tet_stress, drawn_material, extent
@@ -59,8 +59,7 @@ class TetsOver(PointsOver):
         if prim.repaired or not scene.has(prim.path, "surfaceFaceVertexIndices"):
             faces = boundary_faces(prim.tets, prim.points)[0][:, :: -1 if prim.left_handed else 1]
             mesh.CreateSurfaceFaceVertexIndicesAttr(Vt.Vec3iArray.FromNumpy(np.ascontiguousarray(faces)))
-        volumes = np.abs(signed_volumes(prim.points, prim.tets))
-        self._average = VertexAverage(prim.tets, volumes, len(prim.points))
+        self._average = VertexAverage.of(prim)
 
     def samples(  # type: ignore[override]
         self, positions: NDArray[np.float32], velocities: NDArray[np.float32], stress: NDArray[np.float32]
@@ -249,7 +248,7 @@ class SceneWriter(ColoredStage):
         root.subLayerPaths.append(self._below)
         return root
 
-    def _colors(self, samples: Samples, nodal: NDArray[np.float64] | None = None) -> Samples:
+    def _colors(self, samples: Samples) -> Samples:
         colors: Samples = {}
         for soft in self._soft:
             colors |= soft.colors(samples, self.stress_range[1])
@@ -281,12 +280,8 @@ def _way(path: Path, below: Path) -> str:
 
 
 def _flatten(path: Path) -> None:
-    part = path.with_name(f".{path.stem}-flat{path.suffix}")
     try:
-        Usd.Stage.Open(usd_name(path)).Flatten().Export(usd_name(part))
-        sync(part)
-        os.replace(part, path)
+        with written_whole(path) as part:
+            Usd.Stage.Open(usd_name(path)).Flatten().Export(usd_name(part))
     except Tf.ErrorException as error:
         raise OSError(f"{path}: cannot be flattened: {reason(error)}") from None
-    finally:
-        part.unlink(missing_ok=True)

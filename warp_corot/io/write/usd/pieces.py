@@ -65,6 +65,7 @@ class PieceStore:
         check_stage_path(self.path)
         self.pieces_folder = self.path.with_name(self.path.name + ".pieces")
         self._run = self.pieces_folder / f"run-{uuid.uuid4().hex[:8]}"
+        self._reserve = self._run / "part-reserve.bin"
         self._lock: IO[str] | None = None
         self._refuse_second_writer(InputError)
         self.custom_data: dict[str, Any] = {}
@@ -143,7 +144,12 @@ class PieceStore:
             self._broken = True
             if not self._pieces:
                 self._remove_run(self._run)
+            elif self._reserve.exists():
+                self._reserve.unlink()
+                with contextlib.suppress(OSError):
+                    self._write_piece()
             raise OSError(f"{error}; {self._kept()}") from None
+        self._keep_room()
         self._last_flush = time.monotonic()
         self._flush_cost = self._last_flush - started
 
@@ -187,6 +193,14 @@ class PieceStore:
     def last_look(self, samples: Samples) -> Samples:
         """The values of a frame that change at the end."""
         return {}
+
+    def _keep_room(self) -> None:
+        """Reserve as much of the disk as the last piece takes twice: where it fills, that is room for the frames that
+        wait."""
+        wanted = 2 * (self._run / f"piece-{len(self._pieces) - 1:06d}.usdc").stat().st_size
+        with contextlib.suppress(OSError, AttributeError), self._reserve.open("ab") as file:
+            if file.tell() < wanted:
+                os.posix_fallocate(file.fileno(), 0, wanted)
 
     # --- layers ------------------------------------------------------------------------------------------------------
 
@@ -408,21 +422,19 @@ class ColoredStage(PieceStore):
         if self._closed:
             raise InputError(f"{self.path}: is closed; frames must be added before")
 
-    def _add(
-        self, samples: Samples, stress: NDArray[np.float32] | None, nodal: NDArray[np.float64] | None = None
-    ) -> None:
-        """Add a frame with stresses of tetrahedra [T] [Pa], if any, and their averages at nodes [N], if known."""
+    def _add(self, samples: Samples, stress: NDArray[np.float32] | None) -> None:
+        """Add a frame with stresses of tetrahedra [T] [Pa], if any."""
         if stress is not None:
             self.widen_range(self.range_for(stress))
             self._ranges_used.add(self.stress_range)
             lowest, highest = self.stress_range
             legend = {"map": COLORMAP_NAME, "quantity": "von Mises stress", "unit": "Pa"}
             self.custom_data["stressColors"] = legend | {"lowest": lowest, "highest": highest}
-            samples |= self._colors(samples, nodal)
+            samples |= self._colors(samples)
         self.add(float(self.frames), samples)
         self.frames += 1
 
-    def _colors(self, samples: Samples, nodal: NDArray[np.float64] | None = None) -> Samples:
+    def _colors(self, samples: Samples) -> Samples:
         """Colours for the stresses of a frame, in the present range."""
         raise NotImplementedError
 

@@ -15,7 +15,7 @@ from warp_corot.io.files.usd import free_name
 from warp_corot.io.pictures.colors import TISSUE, VertexAverage, color_index, srgb_to_linear, stress_colors
 from warp_corot.io.write.skins import Skin
 from warp_corot.mesh.surfaces.bound import vertex_normals
-from warp_corot.mesh.topology import boundary_faces, signed_volumes
+from warp_corot.mesh.topology import boundary_faces
 
 from .pieces import Samples
 
@@ -32,11 +32,11 @@ class Touched(NamedTuple):
     forces: NDArray[np.float32]
     pressure: NDArray[np.float32]
 
-    def samples(self, path: str, nodes: NDArray[np.int32] | slice = slice(None)) -> Samples:
-        """The primvars of a prim with some of the nodes."""
+    def samples(self, path: str) -> Samples:
+        """The primvars of a prim with the nodes."""
         return {
-            f"{path}.primvars:{FORCE}": Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(self.forces[nodes])),
-            f"{path}.primvars:{PRESSURE}": Vt.FloatArray.FromNumpy(np.ascontiguousarray(self.pressure[nodes])),
+            f"{path}.primvars:{FORCE}": Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(self.forces)),
+            f"{path}.primvars:{PRESSURE}": Vt.FloatArray.FromNumpy(np.ascontiguousarray(self.pressure)),
         }
 
 
@@ -109,7 +109,9 @@ class SkinPrim:
         self._changing = changing and skin.changes
         self._said: Skin | None = None
         look = skin.look
-        self._with_normals = look is None or (look.had_normals and not look.smooth)
+        # The boundary of tetrahedra has none: its edges would look round.
+        is_boundary = bool((skin.surface.weights.max(axis=1) == 1.0).all())
+        self._with_normals = not is_boundary if look is None else look.had_normals and not look.smooth
         self._with_colors = look is None or look.is_plain
         self.follow(skin, rest)
 
@@ -181,7 +183,7 @@ class SkinPrim:
             self._said = self._skin
         return samples
 
-    def colors(self, samples: Samples, limits: Limits, _: Any = None) -> Samples:
+    def colors(self, samples: Samples, limits: Limits) -> Samples:
         """As in `TetPrims.colors`."""
         stress = samples.get(f"{self._path}.primvars:vonMises")
         if not self._with_colors or stress is None:
@@ -283,7 +285,7 @@ def extent(points: NDArray[np.float32]) -> Vt.Vec3fArray:
     return Vt.Vec3fArray.FromNumpy(np.stack([axes.min(axis=1), axes.max(axis=1)]))
 
 
-# --- tetrahedra and their boundary, also of meshes that change -------------------------------------------------------
+# --- tetrahedra, also of meshes that change --------------------------------------------------------------------------
 
 INDICES = f"{TETS}.tetVertexIndices"
 FACES = f"{TETS}.surfaceFaceVertexIndices"
@@ -293,33 +295,28 @@ UNITS = {"young": " [Pa]", "poisson": "", "density": " [kg/m³]"}
 
 
 class TetPrims:
-    """The TetMesh prim and, if it is drawn, the Mesh of the boundary.
+    """The TetMesh prim.
 
     Args:
         present: The body at rest.
-        boundary: Whether the boundary is drawn.
         changing: Whether the mesh may change.
     """
 
-    def __init__(self, present: Present, *, boundary: bool, changing: bool):
-        self._boundary = boundary
+    def __init__(self, present: Present, *, changing: bool):
         self._changing = changing
         self._uniform = [name for name in UNITS if np.size(getattr(present.material, name, 0.0)) == 1]
-        self._said: tuple[Present, SurfaceTriangles] | None = None
+        self._said: Present | None = None
         self.follow(present)
 
     def follow(self, present: Present) -> None:
         """Draw this mesh from the next frame on."""
         self._present = present
-        self._surface = SurfaceTriangles(boundary_faces(present.tets)[0])
 
     @property
     def follows(self) -> dict[str, str]:
         """See `PieceStore.declare`."""
-        moving = ("points", "velocities", *ATTRIBUTES)
-        own = [*moving, "primvars:rest", "primvars:vonMises", *(f"primvars:{name}" for name in UNITS)]
-        found = {f"{TETS}.{name}": INDICES for name in own}
-        return found | {f"{SURFACE}.{name}": f"{SURFACE}.faceVertexIndices" for name in moving}
+        own = ("points", "velocities", *ATTRIBUTES, "primvars:rest", "primvars:vonMises")
+        return {f"{TETS}.{name}": INDICES for name in (*own, *(f"primvars:{name}" for name in UNITS))}
 
     def declare(self, stage: Any, statics: Statics) -> None:
         """Declare everything that does not change, and the attributes that do, without values."""
@@ -332,19 +329,11 @@ class TetPrims:
         if statics.velocities:
             tets.CreateVelocitiesAttr()
         self._declare_primvars(UsdGeom.PrimvarsAPI(tets), statics)
-        declare_moving(tets, statics.stress)
+        declare_moving(tets, statics.stress, colored=False)
         if statics.touched:
             declare_touched(tets)
-        if self._boundary:
-            surface = UsdGeom.Mesh.Define(stage, SURFACE)
-            declare_triangles(surface)
-            declare_moving(surface, statics.stress)
-            if statics.velocities:
-                surface.CreateVelocitiesAttr()
-            if statics.touched:
-                declare_touched(surface)
         if not self._changing:
-            for path, value in {**self._topology(), **self._surface_topology()}.items():
+            for path, value in self._topology().items():
                 stage.GetAttributeAtPath(path).Set(value)
 
     def samples(self, frame: Frame) -> Samples:
@@ -357,61 +346,25 @@ class TetPrims:
             samples[STRESS] = Vt.FloatArray.FromNumpy(frame.stress)
         if frame.touched is not None:
             samples |= frame.touched.samples(TETS)
-            samples |= frame.touched.samples(SURFACE, self._surface.nodes) if self._boundary else {}
-        if self._boundary:
-            nodes = self._surface.nodes
-            samples |= {f"{SURFACE}.points": Vt.Vec3fArray.FromNumpy(x[nodes]), f"{SURFACE}.extent": extent(x[nodes])}
-            if v is not None:
-                samples[f"{SURFACE}.velocities"] = Vt.Vec3fArray.FromNumpy(v[nodes])
         return samples | self._changes() if self._changing else samples
 
-    def colors(self, samples: Samples, limits: Limits, nodal: NDArray[np.float64] | None = None) -> Samples:
-        """Colours for the stresses of a frame, and the data of the mesh if it has changed."""
-        if STRESS not in samples:
-            return {}
-        if nodal is None:
-            nodal = self._averaged(samples)
-        indices = color_index(nodal, *limits)
-        colors = {f"{TETS}.primvars:displayColor:indices": Vt.IntArray.FromNumpy(indices)}
-        if self._boundary:
-            on_surface = Vt.IntArray.FromNumpy(indices[self._surface.nodes])
-            colors[f"{SURFACE}.primvars:displayColor:indices"] = on_surface
-        return colors
-
-    def _averaged(self, samples: Samples) -> NDArray[np.float64]:
-        stress = np.asarray(samples[STRESS])
-        if INDICES in samples and self._changing:
-            points, tets = np.asarray(samples[REST], dtype=np.float64), np.asarray(samples[INDICES])
-            average = VertexAverage(tets, np.abs(signed_volumes(points, tets)), len(points))
-            self._present = self._present._replace(points=points, tets=tets, average=average)
-            self._surface = SurfaceTriangles(np.asarray(samples[FACES]))
-        return self._present.average(stress)
+    def colors(self, samples: Samples, limits: Limits) -> Samples:
+        """Colours for the stresses of a frame: none, as viewers draw the surfaces."""
+        return {}
 
     def _changes(self) -> Samples:
         """Changed values among those that do not change in every frame."""
-        before, self._said = self._said, (self._present, self._surface)
-        if before is not None and before[0] is self._present:
-            return {}
-        samples: Samples = {}
-        if before is None or not (
-            np.array_equal(before[0].tets, self._present.tets)
-            and np.array_equal(before[0].points, self._present.points)
-        ):
-            samples |= self._topology()
-        if before is None or not self._is_same_surface(*before):
-            samples |= self._surface_topology()
-        return samples
-
-    def _is_same_surface(self, present: Present, surface: SurfaceTriangles) -> bool:
-        return np.array_equal(surface.triangles, self._surface.triangles) and np.array_equal(
-            present.points[surface.nodes], self._present.points[self._surface.nodes]
+        before, self._said, now = self._said, self._present, self._present
+        same = before is now or (
+            before is not None and np.array_equal(before.tets, now.tets) and np.array_equal(before.points, now.points)
         )
+        return {} if same else self._topology()
 
     def _topology(self) -> Samples:
         present = self._present
         samples: Samples = {
             INDICES: Vt.Vec4iArray.FromNumpy(present.tets),
-            FACES: Vt.Vec3iArray.FromNumpy(self._surface.faces),
+            FACES: Vt.Vec3iArray.FromNumpy(boundary_faces(present.tets)[0]),
             REST: Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(present.points, dtype=np.float32)),
         }
         if present.fixed is not None:
@@ -425,9 +378,6 @@ class TetPrims:
                 values = floats(given, (len(present.tets),), f"material.{name}")
                 samples[f"{TETS}.primvars:{name}"] = Vt.FloatArray.FromNumpy(values)
         return samples
-
-    def _surface_topology(self) -> Samples:
-        return triangle_samples(SURFACE, self._surface.triangles) if self._boundary else {}
 
     def _declare_primvars(self, primvars: Any, statics: Statics) -> None:
         types, tokens = Sdf.ValueTypeNames, UsdGeom.Tokens
@@ -447,12 +397,3 @@ class TetPrims:
             else:
                 primvar = primvars.CreatePrimvar(name, types.FloatArray, tokens.uniform)
             primvar.GetAttr().SetDocumentation(f"Material: {name}{unit}")
-
-
-class SurfaceTriangles:
-    """The boundary of tetrahedra: its faces [F, 3] in the mesh's nodes, and its own nodes and triangles."""
-
-    def __init__(self, faces: NDArray[np.int32]):
-        self.faces = faces
-        self.nodes, compact = np.unique(faces, return_inverse=True)
-        self.triangles = compact.reshape(-1, 3).astype(np.int32)

@@ -11,7 +11,6 @@ import warp as wp
 from warp_corot.discretization.discretization import Discretization
 from warp_corot.discretization.groups import Members
 from warp_corot.inputs.cpu_threads import Regions, launch
-from warp_corot.kernels.elements.dilatation import not_held
 from warp_corot.kernels.elements.elements import ForestElements
 from warp_corot.kernels.implicit.multigrid import cycle, dense, values
 from warp_corot.kernels.implicit.multigrid import pattern as kernels
@@ -351,7 +350,7 @@ class LeafMatrix:
                 values.gather_leaves, (sizes.worlds, threads), [part, parts, *inputs], outputs, device=self.device
             ),
         )
-        if holds and members is not None and members.law.holding is not not_held:
+        if holds and members is not None and members.law.is_held:
             inputs = [sizes.world_elements, count, found.entries, elements, u, body.lam, body.material_stride]
             inputs += [scales, self._rank, found.starts, found.columns]
             wp.launch(kernels.add_held_blocks(members.law), sizes.elements, inputs, [blocks], device=self.device)
