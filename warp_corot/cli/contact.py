@@ -33,6 +33,8 @@ if TYPE_CHECKING:
 
     from .bodies import RunBody
 
+# --- tools and their paths -------------------------------------------------------------------------------------------
+
 #: Shapes by name, each with the names of the lengths that it takes.
 SHAPES: dict[str, tuple[Callable[..., Shape], str]] = {
     "sphere": (Sphere, "r"),
@@ -155,6 +157,8 @@ def _named_columns(row: list[str], path: Path) -> dict[str, float]:
             raise InputError(f"{path}: column {word.strip()!r}: {error}") from None
     return found
 
+
+# --- what the bodies touch -------------------------------------------------------------------------------------------
 
 #: Overlaps below this fraction of a body's height are rounding and are not reported.
 SMALL = 1e-5

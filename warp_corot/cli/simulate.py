@@ -216,6 +216,8 @@ def _text(text: str) -> str:
     return text.encode("utf-8", errors=_ERRORS).decode("utf-8")
 
 
+# --- the summary -----------------------------------------------------------------------------------------------------
+
 #: Maximum number of regions whose materials are listed.
 MOST_KINDS = 8
 

@@ -261,6 +261,8 @@ def _heard(event: str, args: tuple[Any, ...]) -> None:
             complain(f"compiling kernels for {device}, once: this takes some seconds ...", kind="")
 
 
+# --- several ranks: every rank runs the command, and rank 0 prints and writes ----------------------------------------
+
 #: Time for rank 0 to reach the place where another rank failed, and to report it [s].
 REPORTED_WITHIN = 5.0
 

@@ -189,6 +189,8 @@ def _send(visitor: Visitor, name: str, content: bytes) -> None:
     visitor.send(packed({"kind": "file", "name": name, "size": len(content)}, content))
 
 
+# --- tissues: laws, moduli, and tissues of the literature ------------------------------------------------------------
+
 #: Weight over stiffness, density g L / E, from which on a body of length L hardly keeps its shape.
 COLLAPSING = 0.15
 #: The name of the choice that gives every element its own rotation.
@@ -320,6 +322,8 @@ def _number(text: str) -> int | float | str:
     return text
 
 
+# --- what the browser is told ----------------------------------------------------------------------------------------
+
 #: The table of the colours, as one word of hexadecimal digits.
 _COLORS = np.rint(255.0 * stress_colors()).astype(np.uint8).tobytes().hex()
 #: What is drawn of a ground, which the browser draws itself, and of other obstacles that have no surface.
@@ -404,6 +408,9 @@ def frame_told(session: Session, frame: PageFrame) -> bytes:
 
 
 Command = Callable[[], None]
+
+
+# --- what the browser asks for ---------------------------------------------------------------------------------------
 
 
 def _between(low: float, high: float, given: Any, name: str, unit: str = "") -> float:

@@ -335,6 +335,8 @@ def patch_around(shown: Shown, pick: Pick, radius: float) -> HeldPatch:
 
 Vector = npt.NDArray[np.float64]
 
+# --- rigid tools, and the hand that moves them -----------------------------------------------------------------------
+
 #: The shapes of the tools that a visitor may put into the scene, for a size of the bodies [m].
 SHAPES: dict[str, Callable[..., Shape]] = {
     "ball": lambda size, **pose: Sphere(radius=0.1 * size, **pose),

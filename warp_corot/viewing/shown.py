@@ -222,6 +222,8 @@ def _between(
     return BoundPoints(surface.points[a] + t * (surface.points[b] - surface.points[a]), nodes, weights)
 
 
+# --- colours: sources of values by name, and the range ---------------------------------------------------------------
+
 Values: TypeAlias = npt.NDArray[np.floating]
 
 #: A range of colours that is more than this many times too wide becomes narrower.

@@ -206,6 +206,8 @@ def save_picture(picture: Image, target: Path) -> None:
         picture.save(part, format="PNG")
 
 
+# --- films -----------------------------------------------------------------------------------------------------------
+
 FILMS = (".gif", ".mp4")
 #: Viewers show at most this many frames of a GIF a second; frames in between are left out.
 GIF_FPS = 25.0

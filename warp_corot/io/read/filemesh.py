@@ -260,6 +260,9 @@ def _wound_alike(
     return tets, int(np.count_nonzero(size - np.abs(total) > 1e-6 * size))
 
 
+# --- readers by format, and the message if none can read a file ------------------------------------------------------
+
+
 @dataclass(frozen=True)
 class Reader:
     """A module of this folder with a function that reads a path.
@@ -396,6 +399,9 @@ def checked_mesh(mesh: FileMesh, path: Path) -> FileMesh:
                 f"{path}: {cell} {row} names point {block.nodes[row, column]} but the points are 0 to {len(points) - 1}"
             )
     return mesh
+
+
+# --- scans -----------------------------------------------------------------------------------------------------------
 
 
 def load_volume(path: str | PathLike[str]) -> LoadedVolume:

@@ -29,6 +29,8 @@ from .filemesh import (
     triangles_of,
 )
 
+# --- meshes in Warp's wheel, each with a suitable scale and material -------------------------------------------------
+
 
 @dataclass(frozen=True)
 class Asset:
@@ -120,6 +122,8 @@ def find_asset(name: str | PathLike[str]) -> Asset | None:
         raise InputError(f"warp:{rest}: no such asset; it must be {known}")
     return ASSETS[rest]
 
+
+# --- meshes of tetrahedra and of triangles ---------------------------------------------------------------------------
 
 USD_SUFFIXES = (".usd", ".usda", ".usdc", ".usdz")
 #: Formats that only hold surfaces, see `warp_corot.io.read.meshes`.
@@ -358,6 +362,8 @@ def _objects(mesh: FileMesh, cells: NDArray[np.int64]) -> list[tuple[str, int]]:
     return []
 
 
+# --- surfaces: through trimesh, of USD stages, and of mesh files -----------------------------------------------------
+
 #: Formats read with trimesh, and the usual up axis if the format names none; glTF's is in its standard.
 UP_AXES = {".obj": "Y", ".stl": "Z", ".ply": "Z", ".off": "Z", ".glb": "Y", ".gltf": "Y"}
 GLTF = (".glb", ".gltf")
@@ -422,6 +428,8 @@ def placed_meshes(path: Path, **options: Any) -> list[tuple[Any, NDArray[Any], s
         why = " ".join(str(error).split())[:120]
         raise InputError(f"{path}: is not a {path.suffix} file that trimesh can read triangles from ({why})") from None
 
+
+# --- the array that numbers a file's regions, and their names --------------------------------------------------------
 
 #: Usual names of arrays of region numbers, likeliest first; other arrays qualify if they have few distinct numbers.
 LIKELY = ("physical group", "material", "element set", "region", "label", "tissue", "attribute", "part", "block")

@@ -295,6 +295,8 @@ def joined_surfaces(parts: Sequence[SurfaceMesh]) -> SurfaceMesh:
     )
 
 
+# --- surfaces of rigid obstacles -------------------------------------------------------------------------------------
+
 #: Points around a round shape.
 AROUND = 32
 #: Height of a drawn blade over the length of its edge.

@@ -165,6 +165,8 @@ def _rest_points(prim, path: Path) -> NDArray[np.float64]:
     return np.asarray(value, dtype=np.float64).reshape(-1, 3)
 
 
+# --- Mesh prims with their appearance --------------------------------------------------------------------------------
+
 #: Properties that frames give, or that become invalid when a prim's points are in world coordinates.
 STALE = ("points", "extent", "normals", "velocities", "accelerations", "primvars:normals", "tetraIndices")
 #: Properties that a simulation wrote: the stress, which the colours show, and contact.

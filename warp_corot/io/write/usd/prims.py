@@ -109,15 +109,25 @@ class SkinPrim:
         self._changing = changing and skin.changes
         self._said: Skin | None = None
         look = skin.look
-        # The boundary of tetrahedra has none: its edges would look round.
-        is_boundary = bool((skin.surface.weights.max(axis=1) == 1.0).all())
-        self._with_normals = not is_boundary if look is None else look.had_normals and not look.smooth
         self._with_colors = look is None or look.is_plain
         self.follow(skin, rest)
+        # The boundary of tetrahedra has none: its edges would look round.
+        self._with_normals = self._nodes is None if look is None else look.had_normals and not look.smooth
 
     def follow(self, skin: Skin, rest: NDArray[np.float64]) -> None:
         """Draw the surface bound to another mesh with these rest positions from the next frame on."""
         self._skin, self._rest = skin, np.asarray(rest, dtype=np.float64)
+        # Each point of the boundary of tetrahedra is a node.
+        surface = skin.surface
+        is_boundary = (surface.weights[:, 0] == 1.0).all() and not surface.weights[:, 1:].any()
+        self._nodes = np.ascontiguousarray(surface.nodes[:, 0]) if is_boundary else None
+
+    def _at_points(self, nodal: NDArray[np.floating]) -> NDArray[np.float32]:
+        """Values at nodes, [N] or [N, 3], at the points, [V] or [V, 3]."""
+        surface = self._skin.surface
+        if self._nodes is not None:
+            return nodal[self._nodes].astype(np.float32)
+        return np.einsum("vn,vn...->v...", surface.weights, nodal[surface.nodes]).astype(np.float32)
 
     @property
     def follows(self) -> dict[str, str]:
@@ -156,7 +166,8 @@ class SkinPrim:
     def samples(self, frame: Frame) -> Samples:
         """As in `TetPrims.samples`."""
         surface = self._skin.surface
-        x = surface.moved(frame.positions - self._rest).astype(np.float32)
+        x = frame.positions[self._nodes] if self._nodes is not None else surface.moved(frame.positions - self._rest)
+        x = x.astype(np.float32, copy=False)
         samples: Samples = {
             f"{self._path}.points": Vt.Vec3fArray.FromNumpy(x),
             f"{self._path}.extent": extent(x),
@@ -165,13 +176,12 @@ class SkinPrim:
             normals = vertex_normals(x.astype(np.float64), surface.triangles).astype(np.float32)
             samples[f"{self._path}.normals"] = Vt.Vec3fArray.FromNumpy(normals)
         if frame.nodal is not None:
-            samples[f"{self._path}.primvars:vonMises"] = Vt.FloatArray.FromNumpy(self._skin.values(frame.nodal))
+            samples[f"{self._path}.primvars:vonMises"] = Vt.FloatArray.FromNumpy(self._at_points(frame.nodal))
         if frame.touched is not None:
-            pressure = self._skin.values(frame.touched.pressure.astype(np.float64))
-            samples[f"{self._path}.primvars:{PRESSURE}"] = Vt.FloatArray.FromNumpy(pressure)
+            pressure = Vt.FloatArray.FromNumpy(self._at_points(frame.touched.pressure))
+            samples[f"{self._path}.primvars:{PRESSURE}"] = pressure
         if frame.velocities is not None:
-            of_points = np.einsum("vn,vnc->vc", surface.weights, frame.velocities[surface.nodes])
-            samples[f"{self._path}.velocities"] = Vt.Vec3fArray.FromNumpy(of_points.astype(np.float32))
+            samples[f"{self._path}.velocities"] = Vt.Vec3fArray.FromNumpy(self._at_points(frame.velocities))
         if self._changing:
             said = None if self._said is None else self._said.surface
             names = ("triangles", "points", "of_cut")

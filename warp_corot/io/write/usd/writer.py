@@ -239,6 +239,8 @@ def _place(pose: NDArray[np.float64]) -> tuple[Any, Any]:
     return Gf.Vec3d(*map(float, pose[:3])), Gf.Quatf(w, x, y, z)
 
 
+# --- the writer ------------------------------------------------------------------------------------------------------
+
 __all__ = ["ROOT", "SURFACE", "TETS", "Mesh", "UsdWriter"]
 
 
