@@ -127,37 +127,26 @@ def pressed(scene, device, **options):
 
 @pytest.mark.parametrize("scene", ["held", "between nodes", "own surface", "soft surfaces"])
 def test_contact_is_in_the_matrix(scene, device, rng):
-    """S (A + D + the sum of c c^T) is what the operator does to vectors in the range of S, and solves satisfy it. Where
-    soft surfaces may meet, it is one matrix for all bodies and worlds."""
+    """A and the sum of c c^T are what the operator does, and solves satisfy it. Where soft surfaces may meet, it is one
+    matrix for all bodies and worlds."""
     sim, _ = pressed(scene, device)
     sim.advance_steps(15)
     (solve_of_step,) = sim.recorded._stepper._solves
     system, solve = solve_of_step._system, solve_of_step.choice.assembled
     count = system.worlds * system.node_count
     solve.update()
-    if system.soft is not None:
-        system.soft.update(system.x)
+    system.contact.update(system.x)
+    solve.take_contact(system.contact)
     couplings, b = solve.couplings, on_device(rng.standard_normal((count, 3)), system)
-    rest = system.blocks.of(wp.zeros_like(system.x))
-    for held, x, r, own in zip(system.contacts, system.blocks.of(system.x), rest, system.blocks.of(b), strict=True):
-        held.launch_friction(x, r)
-        if held.nodes is not None:
-            held.nodes.launch_yielding(own)
-    solve.take_contact(system.contacts, system.soft)
     x = b.numpy()[:, :3].astype(float)
-    projectors = np.tile(np.eye(3), (count, 1, 1))
-    is_held = couplings.projected.numpy() != 0
-    projectors[is_held] = couplings.projectors.numpy()[:-1][is_held]
     found = (matrix_of(solve, system.worlds) @ x.ravel()).reshape(-1, 3)
     used = int(couplings.count.numpy()[0])
     for nodes, parts in zip(couplings.nodes.numpy()[:used], couplings.parts.numpy()[:used, :, :3], strict=True):
         c = parts[nodes >= 0].astype(float)
         found[nodes[nodes >= 0]] += (c * x[nodes[nodes >= 0]]).sum() * c
     expected = product(system.apply, x, device)
-    assert (is_held.sum() > 10) == (scene != "own surface")
-    assert couplings.drag.numpy()[is_held].any() == (scene != "own surface")
-    assert (used > 0) == (scene != "held")
-    error = np.abs(np.einsum("nij,nj->ni", projectors, found) - expected).max() / np.abs(expected).max()
+    assert used > 0
+    error = np.abs(found - expected).max() / np.abs(expected).max()
     print(f"{used} products, {error:.1e} of the largest value")
     assert error < 50 * ROUNDING
     change = wp.zeros_like(b)

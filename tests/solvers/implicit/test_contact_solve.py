@@ -8,12 +8,12 @@ from warp_corot.kernels.implicit import contact_solve as kernels
 from warp_corot.kernels.implicit.conjugate_gradients import BEGAN, SCALARS, WITHIN
 
 
-def judged(residuals, pairs=1, changed=0):
+def judged(residuals, pairs=1):
     """Whether contacts are located after each of some solves, and whether another one follows; residuals are those
     with which the solves begin, over the tolerance."""
     locates, rounds, total, solves, going = (wp.zeros(1, dtype=wp.int32, device="cpu") for _ in range(5))
     outer = wp.zeros(1, dtype=wp.float64, device="cpu")
-    given = [wp.array([value], dtype=wp.int32, device="cpu") for value in (1, changed, pairs)]
+    given = [wp.array([value], dtype=wp.int32, device="cpu") for value in (1, pairs)]
     found = []
     for residual in residuals:
         scalars = np.zeros((1, SCALARS))
@@ -33,7 +33,3 @@ def test_contacts_are_located_again_once_forces_are_in_balance():
 @pytest.mark.parametrize(("pairs", "ends"), [(1, [1, 1, 0]), (0, [1, 0, 0])])
 def test_a_step_with_pairs_ends_after_a_solve_for_which_they_were_located(pairs, ends):
     assert [going for _, going in judged([2000.0, 8.0, 5.0], pairs)] == ends
-
-
-def test_a_step_goes_on_while_contact_changes():
-    assert judged([5.0, 5.0], changed=1) == [(0, 1), (0, 1)]
