@@ -136,6 +136,8 @@ class SignedFunction:
         Raises:
             InputError: The domain has no label of this name; the message lists its labels.
         """
+        if name in self.label_names:
+            return self._part(name)
         there = ", ".join(self.label_names) or "none"
         raise InputError(f"there is no label {shown(name)} in this domain; its labels: {there}")
 
@@ -185,6 +187,10 @@ class SignedFunction:
             if not len(going):
                 break
         return np.minimum(gone, reach)
+
+    def _part(self, name: str) -> SignedFunction:
+        """The domain of one of its labels."""
+        raise NotImplementedError
 
     def _details(self) -> list[str]:
         return []
