@@ -12,8 +12,7 @@ from warp_corot.kernels.corotated.anisotropic import vec9
 from warp_corot.kernels.math.rotation import identity3
 from warp_corot.kernels.meshing.bisection import in_child, refinement_end
 from warp_corot.kernels.plan.plan import Plan, extent, leaf_row
-from warp_corot.kernels.remesh.pools import LEAVES, NODE_TOP, Pools
-from warp_corot.kernels.remesh.state import MIXED_ROWS, NO_ROW, Carried, modulus_of
+from warp_corot.kernels.remesh.pools import LEAVES, MIXED_ROWS, NO_ROW, NODE_TOP, Carried, Pools, modulus_of
 
 wp.set_module_options({"enable_backward": False})
 

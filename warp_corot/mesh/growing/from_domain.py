@@ -80,17 +80,15 @@ class Budget:
     Attributes:
         target: The largest number of elements.
         cell_size: Edge of a cube [m]; None: chosen.
-        min_level, max_level: The range of levels; a largest level of None is chosen.
-        surface_error: The error below which the surface is not followed more closely [m]; 0: as the number allows.
+        max_level: The largest level; None: chosen.
         min_layers: Number of elements through the thickness, if the total number allows.
-        wishes: The user's functions.
+        wishes: The least level, the user's functions, and the error below which the surface is not followed more
+            closely, 0: as the number allows.
     """
 
     target: int
     cell_size: float | None
-    min_level: int
     max_level: int | None
-    surface_error: float
     min_layers: float
     wishes: Wishes
 
@@ -165,7 +163,7 @@ def chosen_meshes(domain: Domain, budget: Budget, sliver: float, device: wp.Devi
             best = meshes
         if budget.cell_size or NEAR_ENOUGH * budget.target <= count <= budget.target:
             break
-        if budget.surface_error and count <= budget.target:
+        if budget.wishes.surface_error and count <= budget.target:
             break
         if last and meshes.has_more and count <= budget.target:
             break
@@ -211,12 +209,12 @@ def _of_cubes(
     more = max(math.ceil(3.0 * math.log2(size / suits) - 0.5), 0)
     most = more + MAX_LEVEL + (target > MANY) if budget.max_level is None else budget.max_level
     deepest = more + MAX_LEVEL_THIN if budget.max_level is None else budget.max_level
-    looked = max(min(most + 1, CLOSE_LEVEL + more), min(deepest, budget.min_level))
-    error = max(CLOSE_ERROR * min(size, suits), 0.5 * budget.surface_error)
+    looked = max(min(most + 1, CLOSE_LEVEL + more), min(deepest, budget.wishes.min_level))
+    error = max(CLOSE_ERROR * min(size, suits), 0.5 * budget.wishes.surface_error)
     looking = replace(
         wishes,
         surface_error=error,
-        min_level=min(budget.min_level, looked),
+        min_level=min(budget.wishes.min_level, looked),
         max_level=looked,
         layers=budget.min_layers,
         thin_level=min(deepest, looked + CLOSER_LEVELS),
@@ -232,7 +230,7 @@ def _of_cubes(
     resolved = Resolved(growing.grown(), size, domain)
     needs = needs_of(resolved, domain, budget.min_layers, most, deepest)
     needs = resolved.largest(np.maximum(needs, floor_needs(resolved, points, largest, deepest))).astype(np.float32)
-    found = Meshes(resolved, needs, budget.surface_error, sliver)
+    found = Meshes(resolved, needs, budget.wishes.surface_error, sliver)
     found.choose(int(NEAR * target))
     return found
 
@@ -315,8 +313,7 @@ def mesh_domain(
     if target_elements is not None:
         size = None if cell_size is None else float(cell_size)
         _check_cubes(domain, size, target_elements)
-        error = wishes.surface_error
-        budget = Budget(target_elements, size, min_level, max_level, error, float(min_layers), wishes)
+        budget = Budget(target_elements, size, max_level, float(min_layers), wishes)
         return _of_size(domain, budget, sliver, where)
     if cell_size is None:
         raise InputError("cell_size is None; it must be a length in metres where target_elements is not given")
