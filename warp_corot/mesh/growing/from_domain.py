@@ -23,7 +23,7 @@ from warp_corot.mesh.forest import TetForest
 from warp_corot.mesh.growing.fine_classification import Coarsening, Resolved
 from warp_corot.mesh.growing.growth import Growing
 from warp_corot.mesh.growing.labelling import labels_of, labels_of_nodes
-from warp_corot.mesh.growing.refinement_criteria import THIN_NEED, Field, Wishes
+from warp_corot.mesh.growing.refinement_criteria import GAP_ELEMENTS, THIN_NEED, Field, Wishes
 from warp_corot.mesh.growing.slivers import strays, without_slivers
 from warp_corot.mesh.lattice import check_levels, checked_cell_size, checked_level
 from warp_corot.mesh.surfaces.bound import leaves_at
@@ -45,6 +45,8 @@ MOST_CUBES_OF_BOXES = 7
 #: the longest side need it more, by up to this share; a mesh with less than that share of the elements asked for gets
 #: other cubes first.
 FARTHER_FIRST, FEW = 0.05, 0.6
+#: The assumed error of an element between such pieces, as a fraction of its edge.
+GAP_NEED = 0.5
 #: The drawn surface is closer to the body's than the mesh's threshold by this factor, for which the forest must be
 #: finer still; with many elements it is the mesh's own. Thin parts have no finer elements than the mesh may need.
 FINER_SURFACE, FINER_FOREST, FINER_THIN = 0.3, 0.2, 0.4
@@ -275,6 +277,12 @@ def needs_of(resolved: Resolved, domain: Domain, layers: float, most: int, deepe
     if layers > 0:
         thin = (resolved.thin(domain, layers) < layers * length) & (level < deepest)
         needs[thin] = np.maximum(needs[thin], THIN_NEED * length[thin])
+    gaps = resolved.gaps()
+    if gaps is not None:
+        # Pieces separate if elements of both, and one between them, have room; without room, bisection is in vain.
+        finest = resolved.cell_size * 0.5 ** (deepest / 3.0)
+        close = (GAP_ELEMENTS * length > gaps) & (gaps > GAP_ELEMENTS * finest) & (level < deepest)
+        needs[close] = np.maximum(needs[close], GAP_NEED * length[close])
     return resolved.largest(np.where(resolved.held > 0.0, needs, 0.0)).astype(np.float32)
 
 
