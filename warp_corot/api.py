@@ -6,8 +6,7 @@ from warp_corot.contact.grasp import Grasp
 from warp_corot.contact.options import Contact
 from warp_corot.contact.shapes import Box, Capsule, Cylinder, Ground, SignedDistance, Sphere, TriangleMesh
 from warp_corot.contact.tool import Tool
-from warp_corot.cutting.blade import Blade
-from warp_corot.cutting.plane import Plane
+from warp_corot.cutting.blade import Blade, Plane
 from warp_corot.elasticity.polar import polar_rotation
 from warp_corot.gradients.run import RunGradient, run_gradient
 from warp_corot.gradients.static import StaticGradient, static_gradient

@@ -39,3 +39,25 @@ def halfway(p: wp.vec3i, q: wp.vec3i):
     """The lattice point halfway between two."""
     # Half the difference, because the sum of two numbers may overflow.
     return wp.vec3i(p[0] + (q[0] - p[0]) / 2, p[1] + (q[1] - p[1]) / 2, p[2] + (q[2] - p[2]) / 2)
+
+
+@wp.func
+def in_child(w: wp.vec4d, k: int, second: bool):
+    """Barycentric coordinates in a child from those in its parent, whose refinement edge is x0-xk.
+
+    With z halfway between x0 and xk, a point is in the first child if its coordinate at x0 is the larger one: then z
+    gets twice that at xk, and x0 the rest; in the second child the other way round.
+    """
+    lower = w[0]
+    upper = w[k]
+    child = w
+    if second:
+        for n in range(3):
+            if n + 1 <= k:
+                child[n] = w[n + 1]
+        child[k - 1] = upper - lower
+        child[k] = wp.float64(2.0) * lower
+    else:
+        child[0] = lower - upper
+        child[k] = wp.float64(2.0) * upper
+    return child

@@ -250,13 +250,14 @@ def evaluate_thickness(
     points: wp.array[wp.vec3],
     inward: wp.array[wp.vec3],
     reach: float,
+    side: float,
     mesh: wp.uint64,
     # Out
     thickness: wp.array[wp.float32],
 ):
-    """The distance along a direction to where a ray leaves the body, ``reach`` if it is farther.
+    """The distance along a direction to where a ray leaves the body (``side`` 1) or its surroundings (-1).
 
-    A triangle with the opposite orientation is an entry: an overlapping part.
+    ``reach`` if it is farther. A triangle with the opposite orientation is an entry: an overlapping part.
     """
     i = wp.tid()
     direction = inward[i]
@@ -267,7 +268,7 @@ def evaluate_thickness(
             found = wp.mesh_query_ray(mesh, points[i] + at * direction, direction, reach - at)
             if not found.result:
                 at = reach
-            elif wp.dot(wp.mesh_eval_face_normal(mesh, found.face), direction) > 0.0:
+            elif side * wp.dot(wp.mesh_eval_face_normal(mesh, found.face), direction) > 0.0:
                 thickness[i] = at + found.t
                 at = reach
             else:

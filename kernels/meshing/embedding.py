@@ -4,7 +4,7 @@ import warp as wp
 
 from warp_corot.kernels.modules import unique_kernel
 
-from .bisection import refinement_end
+from .bisection import in_child, refinement_end
 from .growth import VOID
 
 wp.set_module_options({"enable_backward": False})
@@ -64,30 +64,15 @@ def descend(
     # Out
     leaves: wp.array[wp.int32],
 ):
-    """The live leaf that contains a point, -1 for none, found from the root that does, by barycentric coordinates.
-
-    With z halfway between x0 and xk, the point is in the first child if its coordinate at x0 is the larger one: then
-    z gets twice that at xk, and x0 the rest; in the second child the other way round.
-    """
+    """The live leaf that contains a point, -1 for none, found from the root that does, by barycentric coordinates."""
     i = wp.tid()
     element = roots[i]
     w = weights[i]
     while first_child[element] >= 0:
         k = refinement_end(level[element])
-        child = first_child[element]
-        lower = w[0]
-        upper = w[k]
-        if lower >= upper:
-            w[0] = lower - upper
-            w[k] = wp.float64(2.0) * upper
-        else:
-            for n in range(3):
-                if n + 1 <= k:
-                    w[n] = w[n + 1]
-            w[k - 1] = upper - lower
-            w[k] = wp.float64(2.0) * lower
-            child += 1
-        element = child
+        second = w[0] < w[k]
+        element = first_child[element] + wp.where(second, 1, 0)
+        w = in_child(w, k, second)
     leaves[i] = wp.where(first_child[element] == VOID, -1, element)
 
 

@@ -16,8 +16,7 @@ from warp_corot.kernels.elements.elements import load_node
 from warp_corot.kernels.stepping.pace import DONE, DT, Pace
 
 from .cut_surface import BUNDLE, Surface
-from .pools import LEAVES, Pools
-from .state import Carried, doubled, modulus_of
+from .pools import LEAVES, Carried, Pools, doubled, modulus_of
 
 wp.set_module_options({"enable_backward": False})
 

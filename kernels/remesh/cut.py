@@ -28,8 +28,7 @@ from warp_corot.kernels.remesh.cut_surface import (
     place_of,
     radius,
 )
-from warp_corot.kernels.remesh.pools import ADDED, FRESH, FULL, LEAVES, REFINE, REMOVED, Pools
-from warp_corot.kernels.remesh.state import Carried, doubled
+from warp_corot.kernels.remesh.pools import ADDED, FRESH, FULL, LEAVES, REFINE, REMOVED, Carried, Pools, doubled
 
 wp.set_module_options({"enable_backward": False})
 

@@ -4,8 +4,7 @@ import warp as wp
 
 from warp_corot.kernels.elements.elements import load_node
 
-from .pools import Pools
-from .state import Carried, doubled
+from .pools import Carried, Pools, doubled
 
 wp.set_module_options({"enable_backward": False})
 

@@ -10,30 +10,11 @@ import warp as wp
 
 from warp_corot.kernels.corotated.anisotropic import vec9
 from warp_corot.kernels.math.rotation import identity3
-from warp_corot.kernels.meshing.bisection import refinement_end
+from warp_corot.kernels.meshing.bisection import in_child, refinement_end
 from warp_corot.kernels.plan.plan import Plan, extent, leaf_row
-from warp_corot.kernels.remesh.pools import LEAVES, NODE_TOP, Pools
-from warp_corot.kernels.remesh.state import MIXED_ROWS, NO_ROW, Carried, modulus_of
+from warp_corot.kernels.remesh.pools import LEAVES, MIXED_ROWS, NO_ROW, NODE_TOP, Carried, Pools, modulus_of
 
 wp.set_module_options({"enable_backward": False})
-
-
-@wp.func
-def in_child(w: wp.vec4d, k: int, second: bool):
-    """Barycentric coordinates in a child from those in its parent, whose refinement edge is x0-xk."""
-    lower = w[0]
-    upper = w[k]
-    child = w
-    if second:
-        for n in range(3):
-            if n + 1 <= k:
-                child[n] = w[n + 1]
-        child[k - 1] = upper - lower
-        child[k] = wp.float64(2.0) * lower
-    else:
-        child[0] = lower - upper
-        child[k] = wp.float64(2.0) * upper
-    return child
 
 
 @wp.kernel(enable_backward=False)

@@ -17,10 +17,11 @@ from warp_corot.kernels.remesh.pools import (
     OLD_TOP,
     REMOVED,
     UNUSED,
+    Carried,
     Pools,
+    move_node,
     padding,
 )
-from warp_corot.kernels.remesh.state import Carried, move_node
 
 wp.set_module_options({"enable_backward": False})
 

@@ -30,9 +30,12 @@ from warp_corot.kernels.remesh.pools import (
     REFINE,
     STAMP,
     WANTED,
+    Carried,
     Pools,
+    copy_to_children,
+    make_node,
+    quarter_mass,
 )
-from warp_corot.kernels.remesh.state import Carried, copy_to_children, make_node, quarter_mass
 from warp_corot.kernels.tables.shapes import FIRST_NODE, FRAME_SHIFT, SECOND_NODE
 
 wp.set_module_options({"enable_backward": False})

@@ -11,8 +11,20 @@ from warp_corot.kernels.meshing.bisection import refinement_end
 from warp_corot.kernels.meshing.growth import LIVE
 from warp_corot.kernels.plan.plan import TORN
 
-from .pools import CANDIDATES, FREE_PAIRS, LEAVES, NODES_GIVEN, PAIRS_GIVEN, SIMPLIFY, UNUSED, Pools
-from .state import Carried, average_children, quarter_mass, unmake_node
+from .pools import (
+    CANDIDATES,
+    FREE_PAIRS,
+    LEAVES,
+    NODES_GIVEN,
+    PAIRS_GIVEN,
+    SIMPLIFY,
+    UNUSED,
+    Carried,
+    Pools,
+    average_children,
+    quarter_mass,
+    unmake_node,
+)
 
 wp.set_module_options({"enable_backward": False})
 

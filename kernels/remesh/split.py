@@ -17,8 +17,7 @@ from warp_corot.kernels.meshing.bisection import refinement_end
 from warp_corot.kernels.plan.plan import TORN
 
 from .cut import COPIES, MARKED, STAMP, STARS, Cuts, add_star, face_node, forget, is_cut, meet, star_count
-from .pools import ADDED, FULL, LEAVES, NODE_TOP, Pools
-from .state import Carried, copy_node, quarter_mass, refresh_mass
+from .pools import ADDED, FULL, LEAVES, NODE_TOP, Carried, Pools, copy_node, quarter_mass, refresh_mass
 
 wp.set_module_options({"enable_backward": False})
 

@@ -122,8 +122,7 @@ def test_slots_are_the_oracles(mesh, level, rotation_level, grouped, device):
 
 @pytest.mark.parametrize("threads", [2, 7, 5000])
 def test_any_number_of_threads_makes_the_same_plan(threads, device, monkeypatch):
-    for module in ("fixed", "planner"):
-        monkeypatch.setattr(f"warp_corot.discretization.planning.{module}.threads_on", lambda device: threads)
+    monkeypatch.setattr("warp_corot.discretization.planner.threads_on", lambda device: threads)
     forest, device = mixed(7), wp.get_device(device)
     options = {"worlds": 2, "grouped": True, "deterministic": True}
     plan = ForcePlan.of_forest(forest, 4, device, **options)
@@ -146,7 +145,7 @@ def test_a_field_without_subtrees_has_slots_and_units_too(device):
 
 
 def test_more_slots_than_can_be_numbered_are_refused(device, monkeypatch):
-    monkeypatch.setattr("warp_corot.discretization.slots.MOST_SLOTS", 100)
+    monkeypatch.setattr("warp_corot.discretization.plan.MOST_SLOTS", 100)
     body = wc.SoftBody(uniform(5), MATERIAL, device=device)
     for subtrees in (True, False):
         with pytest.raises(wc.InputError, match="slots for forces; there can be 100 at most"):

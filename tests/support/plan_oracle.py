@@ -65,7 +65,7 @@ class OracleBatch:
 
 
 class OraclePlan:
-    """What ``planning.fixed.ForcePlan`` must be.
+    """What ``planner.ForcePlan`` must be.
 
     Attributes:
         batches: ``OracleBatch``es.

@@ -172,7 +172,7 @@ def chosen(values: wp.array, places: wp.array) -> wp.array:
 # The force plan: complete subtrees in batches of one type, and the remaining leaves.
 #
 # Meshing edits the tree. The plan is derived from the tree on the device, and steps read only the plan. It is derived
-# once if the mesh never changes (``planning.fixed``), otherwise after each pass (``changing.plan``).
+# once if the mesh never changes (``planner``), otherwise after each pass (``changing.plan``).
 
 
 __all__ = ["Batch", "FlatLeaves", "LeafCounts", "Plan", "Sharing", "Units"]

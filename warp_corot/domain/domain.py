@@ -233,7 +233,7 @@ class Domain(SignedFunction):
         return _Made(CapsuleDomain(start, end, radius, **options))
 
 
-@forwards("kind", "holds", "exits", "points_in", "label_volumes")
+@forwards("kind", "has_pieces", "holds", "exits", "points_in", "label_volumes")
 @forwards("kind", "_phi", "_labels", "_thickness", "_details")
 class _Made(Domain):
     """A signed function of any kind, as a user holds it."""

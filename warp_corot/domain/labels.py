@@ -417,10 +417,7 @@ class LabelDomain(SignedFunction):
         counts = np.bincount(self.numbers.ravel(), minlength=len(self.label_names) + 1)[1:]
         return counts * abs(float(np.linalg.det(self.affine[:3, :3])))
 
-    def part(self, name: str) -> SignedFunction:
-        """See `Domain.part`."""
-        if name not in self.label_names:
-            return super().part(name)
+    def _part(self, name: str) -> SignedFunction:
         chosen = (self.numbers == self.label_names.index(name) + 1).astype(np.int16)
         options = {"up_axis": self.up_axis, "device": self.device}
         return LabelDomain(chosen, self.affine, [name], self.smoothing, **options)

@@ -209,10 +209,7 @@ class UnionDomain(DomainPair):
         wp.launch(kernels.choose_labels, points.size, [*phis, *labels, renumbered], [labels[0]], device=points.device)
         return labels[0]
 
-    def part(self, name: str) -> SignedFunction:
-        """See `Domain.part`."""
-        if name not in self.label_names:
-            return super().part(name)
+    def _part(self, name: str) -> SignedFunction:
         first = self.first.part(name) if name in self.first.label_names else None
         if name not in self.second.label_names:
             return first or self
@@ -240,10 +237,7 @@ class IntersectionDomain(DomainPair):
     def _labels(self, points: wp.array) -> wp.array:
         return (self.first if self.first.label_names else self.second)._labels(points)
 
-    def part(self, name: str) -> SignedFunction:
-        """See `Domain.part`."""
-        if name not in self.label_names:
-            return super().part(name)
+    def _part(self, name: str) -> SignedFunction:
         one, other = (self.first, self.second) if self.first.label_names else (self.second, self.first)
         return IntersectionDomain(one.part(name), other)
 
@@ -259,9 +253,8 @@ class DifferenceDomain(DomainPair):
     def _labels(self, points: wp.array) -> wp.array:
         return self.first._labels(points)
 
-    def part(self, name: str) -> SignedFunction:
-        """See `Domain.part`."""
-        return DifferenceDomain(self.first.part(name), self.second) if name in self.label_names else super().part(name)
+    def _part(self, name: str) -> SignedFunction:
+        return DifferenceDomain(self.first.part(name), self.second)
 
 
 class NamedDomain(SignedFunction):
@@ -279,9 +272,8 @@ class NamedDomain(SignedFunction):
     def _labels(self, points: wp.array) -> wp.array:
         return wp.full(points.size, 1, wp.int32, device=points.device)
 
-    def part(self, name: str) -> SignedFunction:
-        """See `Domain.part`."""
-        return self if name in self.label_names else super().part(name)
+    def _part(self, name: str) -> SignedFunction:
+        return self
 
     def _details(self) -> list[str]:
         return self.body._details()

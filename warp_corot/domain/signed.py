@@ -102,21 +102,30 @@ class SignedFunction:
         """The function itself, an object of the class of its kind; for a ``Domain``, the function that it contains."""
         return self
 
-    def thickness(self, points: npt.ArrayLike, inward: npt.ArrayLike, reach: float) -> np.ndarray:
+    @property
+    def has_pieces(self) -> bool:
+        """Whether the body has, or may have, several pieces, which must not be joined by the mesh."""
+        return False
+
+    def thickness(
+        self, points: npt.ArrayLike, inward: npt.ArrayLike, reach: float, *, outside: bool = False
+    ) -> np.ndarray:
         """The thickness of the body at points of its surface: the distance inwards until one leaves it again.
 
         Args:
             points: Points on or near the surface [n, 3] [m].
             inward: Unit vectors [n, 3].
             reach: The largest thickness that is measured [m].
+            outside: Measure outwards instead: the widths of gaps.
 
         Returns:
             float64 [n] [m].
         """
-        given, directions = self._on_device(points), self._on_device(inward)
+        side = -1.0 if outside else 1.0
+        given, directions = self._on_device(points), self._on_device(side * checked_numbers(inward, "inward", "[n, 3]"))
         if len(given) != len(directions):
             raise InputError(f"inward has {len(directions)} vectors; there must be one for each of {len(given)} points")
-        return self._thickness(given, directions, checked_length(reach, "reach")).astype(np.float64)
+        return self._thickness(given, directions, checked_length(reach, "reach"), side).astype(np.float64)
 
     def exits(self, starts: np.ndarray, ends: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
         """Where segments from inside to outside leave the body, by its triangles; None if it has none.
@@ -136,6 +145,8 @@ class SignedFunction:
         Raises:
             InputError: The domain has no label of this name; the message lists its labels.
         """
+        if name in self.label_names:
+            return self._part(name)
         there = ", ".join(self.label_names) or "none"
         raise InputError(f"there is no label {shown(name)} in this domain; its labels: {there}")
 
@@ -168,8 +179,8 @@ class SignedFunction:
         """Labels int32 [n] on the points' device; outside the body the labels of the nearest part."""
         raise NotImplementedError
 
-    def _thickness(self, points: wp.array, along: wp.array, reach: float) -> np.ndarray:
-        """The thickness of the body, float32 [n] [m].
+    def _thickness(self, points: wp.array, along: wp.array, reach: float, side: float) -> np.ndarray:
+        """The thickness of the body for a ``side`` of 1, of the space around it for -1: float32 [n] [m].
 
         By sphere tracing: each step is the distance within which there can be no surface.
         """
@@ -177,7 +188,7 @@ class SignedFunction:
         gone = np.full(len(start), SPHERE_STEP * reach, np.float32)
         going = np.arange(len(start))
         for _ in range(SPHERES):
-            phi = self.phi(start[going] + gone[going, None] * along[going])
+            phi = side * self.phi(start[going] + gone[going, None] * along[going])
             inside = phi < 0.0
             going, step = going[inside], np.abs(phi[inside]) / self.lipschitz
             gone[going] += np.maximum(step, SPHERE_STEP * reach)
@@ -185,6 +196,10 @@ class SignedFunction:
             if not len(going):
                 break
         return np.minimum(gone, reach)
+
+    def _part(self, name: str) -> SignedFunction:
+        """The domain of one of its labels."""
+        raise NotImplementedError
 
     def _details(self) -> list[str]:
         return []

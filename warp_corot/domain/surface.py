@@ -98,7 +98,11 @@ class SurfaceDomain(SignedFunction):
         """The body's pieces; see `joined_parts`."""
         return joined_parts(self.closed, self.device)
 
-    def _thickness(self, points: wp.array, along: wp.array, reach: float) -> np.ndarray:
+    @property
+    def has_pieces(self) -> bool:
+        return self.closed.pieces > 1
+
+    def _thickness(self, points: wp.array, along: wp.array, reach: float, side: float) -> np.ndarray:
         found = wp.empty(points.size, wp.float32, device=points.device)
         # A little inside, so that a ray does not hit the surface on which it starts.
         start = wp.array(points.numpy() + START * reach * along.numpy(), dtype=wp.vec3, device=points.device)
@@ -106,7 +110,7 @@ class SurfaceDomain(SignedFunction):
         launch_side_by_side(
             kernels.evaluate_thickness,
             points.size,
-            lambda own: ([own(start), own(along), reach, mesh.id], [own(found)]),
+            lambda own: ([own(start), own(along), reach, side, mesh.id], [own(found)]),
             points.device,
         )
         return np.minimum(found.numpy() + START * reach, reach)

@@ -18,7 +18,6 @@ import itertools
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
@@ -90,31 +89,6 @@ def numbered(touched: IntArray, place_count: int) -> tuple[IntArray, IntArray]:
 SUBTREE_DEPTH = 3
 #: Grid places are numbered in 32 bits.
 MOST_PLACES = 2**31 - 1
-
-
-class PartTree(Tree):
-    """A tree whose live leaves all have one level and come last, in tree order.
-
-    Args:
-        tets, level, parent, first_child: As for ``Tree``.
-        count: Number of live leaves.
-    """
-
-    def __init__(self, tets: IntArray, level: IntArray, parent: IntArray, first_child: IntArray, count: int):
-        super().__init__(tets, level, parent, first_child)
-        object.__setattr__(self, "_count", count)
-
-    @cached_property
-    def leaves(self) -> np.ndarray:
-        return np.arange(len(self.level) - self._count, len(self.level), dtype=np.int32)  # type: ignore[attr-defined]
-
-    @cached_property
-    def leaf_tets(self) -> np.ndarray:
-        return self.tets[len(self.tets) - self._count :]  # type: ignore[attr-defined]
-
-    @cached_property
-    def leaf_levels(self) -> np.ndarray:
-        return np.broadcast_to(self.level[-1], self._count)  # type: ignore[attr-defined]
 
 
 @dataclass(frozen=True, eq=False)
@@ -236,7 +210,7 @@ def _coordinates(places: npt.NDArray[np.integer], grid: tuple[int, int, int]) ->
     return found
 
 
-def _tree(coarse: list[_Elements], number: IntArray, leaves: IntArray, level: int) -> PartTree:
+def _tree(coarse: list[_Elements], number: IntArray, leaves: IntArray, level: int) -> Tree:
     depth, subtrees = len(coarse) - 1, len(leaves) >> SUBTREE_DEPTH
     sizes = [len(each.number) for each in coarse] + [subtrees << n for n in range(1, SUBTREE_DEPTH + 1)]
     starts = np.concatenate([[0], np.cumsum(sizes)])
@@ -259,7 +233,7 @@ def _tree(coarse: list[_Elements], number: IntArray, leaves: IntArray, level: in
         for corner, (leaf, place) in enumerate(corner_leaves(at, level)):
             own[:, corner] = leaves[leaf :: 2 ** (level - at), place]
     levels = np.repeat(np.arange(level + 1, dtype=np.int32), sizes)
-    return PartTree(tets, levels, parent, first_child, len(leaves))
+    return Tree(tets, levels, parent, first_child)
 
 
 Ints = npt.NDArray[np.int32]

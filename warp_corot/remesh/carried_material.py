@@ -20,7 +20,7 @@ from warp_corot.discretization.levels import TreeNodes
 from warp_corot.inputs.cpu_threads import team_of
 from warp_corot.kernels.corotated.anisotropic import OrthotropicMaterial, vec9
 from warp_corot.kernels.remesh.derived import READ_LEAVES, WRITE_LEAVES, assemble_materials
-from warp_corot.kernels.remesh.state import FIRST, MEAN_IF_ALIKE, MEAN_OF_CONTENTS, NO_ROW
+from warp_corot.kernels.remesh.pools import FIRST, MEAN_IF_ALIKE, MEAN_OF_CONTENTS, NO_ROW
 from warp_corot.materials.anisotropic import FRAME_ENTRIES, STIFFNESS_ENTRIES, Directional
 from warp_corot.materials.isotropic import Isotropic, Material
 from warp_corot.mesh import TetForest

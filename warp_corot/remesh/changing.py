@@ -19,7 +19,7 @@ from warp_corot.discretization.sizes import Clock
 from warp_corot.errors import InputError
 from warp_corot.kernels.remesh.criteria import elongation, marking_kernel, nearness
 from warp_corot.kernels.remesh.cut_surface import Surface
-from warp_corot.kernels.remesh.state import MEAN_OF_CONTENTS
+from warp_corot.kernels.remesh.pools import MEAN_OF_CONTENTS
 from warp_corot.kernels.stepping.integrate import set_start
 from warp_corot.mesh import TetForest
 from warp_corot.mesh.lattice import volume_shares

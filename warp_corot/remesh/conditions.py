@@ -14,7 +14,7 @@ from warp_corot.body.keyframes import Followed, NodeKeyframes
 from warp_corot.discretization.changing.pools import DeviceForest
 from warp_corot.kernels.plan.changing import begin_counts
 from warp_corot.kernels.remesh import derived as kernels
-from warp_corot.kernels.remesh.state import MIXED_ROWS, NO_ROW
+from warp_corot.kernels.remesh.pools import MIXED_ROWS, NO_ROW
 from warp_corot.remesh.carried_material import ACTIVATION, ACTIVATION_ROW, CarriedActivation
 
 if TYPE_CHECKING:

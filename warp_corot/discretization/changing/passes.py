@@ -19,7 +19,7 @@ from warp_corot.errors import InputError
 from warp_corot.inputs.checks import checked_number, shown
 from warp_corot.kernels.plan.changing import begin_counts
 from warp_corot.kernels.remesh import derived as kernels
-from warp_corot.kernels.remesh import order, refine, simplify, state
+from warp_corot.kernels.remesh import order, refine, simplify
 from warp_corot.kernels.remesh import pools as pool_kernels
 from warp_corot.kernels.remesh.criteria import PARAMETER_COUNTS, Contents, elongation, marking_kernel
 from warp_corot.mesh.lattice import MAX_LEVEL, check_levels, lattice_spacing
@@ -197,9 +197,9 @@ class RemeshPass:
         self._many(simplify.offer_nodes, self.levels[0], self._kept, carried, pools, removal)
         self._many(simplify.remove_nodes, pools, carried, removal)
         self._once(pool_kernels.give_back, pools)
-        self._many(state.settle_ends, pools, carried)
+        self._many(pool_kernels.settle_ends, pools, carried)
         self._launch_moves()
-        self._many(state.refresh_masses, pools, carried)
+        self._many(pool_kernels.refresh_masses, pools, carried)
         self._many(order.count_leaves, pools, self._sums)
         wp.utils.array_scan(self._sums, self._ends, inclusive=True)
         self._many(order.list_leaves, self._ends, pools)

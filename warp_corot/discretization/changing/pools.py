@@ -17,8 +17,7 @@ from warp_corot.discretization.planner import threads_on
 from warp_corot.errors import InputError
 from warp_corot.inputs.checks import checked_count, checked_device
 from warp_corot.kernels.remesh import pools as kernels
-from warp_corot.kernels.remesh.pools import SINKS
-from warp_corot.kernels.remesh.state import NO_ROW, Carried
+from warp_corot.kernels.remesh.pools import NO_ROW, SINKS, Carried
 from warp_corot.kernels.tables.shapes import FRAME_SHIFT
 from warp_corot.mesh import TetForest
 from warp_corot.mesh.tree import LIVE, VOID, Tree, renumbered
@@ -27,7 +26,7 @@ from warp_corot.mesh.tree import LIVE, VOID, Tree, renumbered
 OF_NODES: tuple[str, ...] = ("lattice", "ends", "valence")
 OF_TETRAHEDRA: tuple[str, ...] = ("tets", "level", "parent", "first_child", "code", "cut")
 
-#: Of ``kernels.remesh.state.Carried``.
+#: Of ``kernels.remesh.pools.Carried``.
 CARRIED_BY_NODES: tuple[str, ...] = (
     "rest",
     "u",
@@ -65,7 +64,7 @@ _CARRIED = (*CARRIED_BY_NODES, *CARRIED_BY_TETRAHEDRA, "impulse", "cut_area")
 
 
 class Piece(NamedTuple):
-    """One stretch of an array of ``kernels.remesh.pools.Pools`` or ``kernels.remesh.state.Carried``."""
+    """One stretch of an array of ``kernels.remesh.pools.Pools`` or ``kernels.remesh.pools.Carried``."""
 
     name: str
     start: int
@@ -86,7 +85,7 @@ class Snapshot:
 
     @classmethod
     def of(cls, pools: kernels.Pools, carried: Carried) -> Snapshot:
-        """The present state of ``kernels.remesh.pools.Pools`` and ``kernels.remesh.state.Carried``."""
+        """The present state of ``kernels.remesh.pools.Pools`` and ``kernels.remesh.pools.Carried``."""
         counts = pools.counts.numpy().copy()
         stretches = ((name, start, count) for name, start, count in _in_use(pools, carried, counts) if count)
         pieces = (

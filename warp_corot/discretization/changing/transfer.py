@@ -12,8 +12,7 @@ import warp as wp
 from warp_corot.discretization.sizes import padded
 from warp_corot.errors import InputError
 from warp_corot.kernels.remesh.derived import bind_points
-from warp_corot.kernels.remesh.pools import SINKS, Pools
-from warp_corot.kernels.remesh.state import MEAN, NO_ROW, Carried
+from warp_corot.kernels.remesh.pools import MEAN, NO_ROW, SINKS, Carried, Pools
 from warp_corot.mesh import TetForest
 from warp_corot.mesh.lattice import MAX_LEVEL, lattice_spacing, volume_shares
 from warp_corot.mesh.surfaces.bound import BoundPoints, DeviceBinding
@@ -21,7 +20,7 @@ from warp_corot.mesh.surfaces.bound import BoundPoints, DeviceBinding
 
 @dataclass(frozen=True, eq=False)
 class Column:
-    """Values of leaves, [T] or one for all, and the rule for a parent's value; see ``kernels.remesh.state``."""
+    """Values of leaves, [T] or one for all, and the rule for a parent's value; see ``kernels.remesh.pools``."""
 
     values: npt.ArrayLike
     merging: int = int(MEAN)
@@ -51,7 +50,7 @@ class Carriage:
         device: Where the arrays are.
 
     Attributes:
-        arrays: ``kernels.remesh.state.Carried``; nodal arrays by the nodes' places in the pool, with the places that
+        arrays: ``kernels.remesh.pools.Carried``; nodal arrays by the nodes' places in the pool, with the places that
             padding names behind them, others by those of the tetrahedra. ``rest``, ``u``, ``v``, ``load``,
             ``reaction``, ``mass32`` and ``inverse_mass`` are what stepping reads and writes.
         names, number_names: Names of the columns of ``arrays.values`` and ``arrays.numbers``.

@@ -13,12 +13,13 @@ from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from warp_corot.mesh.bisection import far_end
-from warp_corot.mesh.growing.refinement_criteria import FARTHER, ROUGH, surface_points
+from warp_corot.mesh.growing.refinement_criteria import FARTHER, GAP_ELEMENTS, ROUGH, surface_points
 from warp_corot.mesh.lattice import lattice_spacing, volume_shares
 from warp_corot.mesh.scattered import spread_over_eighths
-from warp_corot.mesh.topology import codes
+from warp_corot.mesh.topology import codes, connected
 from warp_corot.mesh.tree import LIVE, VOID, Tree
 
 if TYPE_CHECKING:
@@ -154,6 +155,8 @@ def wall_shares(corners: np.ndarray, points: np.ndarray, sampled: np.ndarray, do
 BELOW = -3
 
 
+#: Pieces below this fraction of the body do not count, and more pieces than this are fragments of unresolved parts.
+LEAST_PIECE, MOST_PIECES = 1.0e-4, 16
 #: Approximate number of all points.
 MOST_POINTS = 250_000
 #: A leaf with a corner inside the body counts as filled to at least this share.
@@ -273,6 +276,28 @@ class Resolved:
             tets, spacing = grown.tree.tets[cut], lattice_spacing(self.cell_size)
             x, inward = surface_points(grown.lattice[tets], grown.phi[tets], np.asarray(grown.origin), spacing)
             found[cut] = domain.thickness(x, inward, FARTHER * layers * self.cell_size)
+        return self.smallest(found)
+
+    def gaps(self) -> np.ndarray | None:
+        """The smallest distance from the surface in each tetrahedron to another piece of the body, float64 [M] [m];
+        None if there is one piece, or implausibly many.
+        """
+        grown = self.grown
+        tets = grown.tree.tets[self.leaves]
+        if not len(tets):
+            return None
+        piece = connected(np.where(grown.phi[tets] < 0, tets, np.int32(-1)))
+        sizes = np.bincount(piece, self.shares * self.volume[self.leaves])
+        real = np.flatnonzero(sizes > LEAST_PIECE * sizes.sum())
+        if not 1 < len(real) <= MOST_PIECES:
+            return None
+        at_surface = np.flatnonzero((grown.phi[tets] >= 0).any(axis=1) & np.isin(piece, real))
+        piece, x = piece[at_surface], self.points(tets[at_surface]).mean(axis=1)
+        found = np.full(len(self.held), np.inf)
+        for number in real:
+            own, other = piece == number, cKDTree(x[piece != number])
+            near = GAP_ELEMENTS * self.cell_size
+            found[self.leaves[at_surface[own]]] = other.query(x[own], distance_upper_bound=near)[0]
         return self.smallest(found)
 
     def _upwards(self, values: np.ndarray, ufunc: np.ufunc) -> np.ndarray:

@@ -23,7 +23,7 @@ from warp_corot.mesh.forest import TetForest
 from warp_corot.mesh.growing.fine_classification import Coarsening, Resolved
 from warp_corot.mesh.growing.growth import Growing
 from warp_corot.mesh.growing.labelling import labels_of, labels_of_nodes
-from warp_corot.mesh.growing.refinement_criteria import THIN_NEED, Field, Wishes
+from warp_corot.mesh.growing.refinement_criteria import GAP_ELEMENTS, THIN_NEED, Field, Wishes
 from warp_corot.mesh.growing.slivers import strays, without_slivers
 from warp_corot.mesh.lattice import check_levels, checked_cell_size, checked_level
 from warp_corot.mesh.surfaces.bound import leaves_at
@@ -45,6 +45,8 @@ MOST_CUBES_OF_BOXES = 7
 #: the longest side need it more, by up to this share; a mesh with less than that share of the elements asked for gets
 #: other cubes first.
 FARTHER_FIRST, FEW = 0.05, 0.6
+#: The assumed error of an element between such pieces, as a fraction of its edge.
+GAP_NEED = 0.5
 #: The drawn surface is closer to the body's than the mesh's threshold by this factor, for which the forest must be
 #: finer still; with many elements it is the mesh's own. Thin parts have no finer elements than the mesh may need.
 FINER_SURFACE, FINER_FOREST, FINER_THIN = 0.3, 0.2, 0.4
@@ -80,17 +82,15 @@ class Budget:
     Attributes:
         target: The largest number of elements.
         cell_size: Edge of a cube [m]; None: chosen.
-        min_level, max_level: The range of levels; a largest level of None is chosen.
-        surface_error: The error below which the surface is not followed more closely [m]; 0: as the number allows.
+        max_level: The largest level; None: chosen.
         min_layers: Number of elements through the thickness, if the total number allows.
-        wishes: The user's functions.
+        wishes: The least level, the user's functions, and the error below which the surface is not followed more
+            closely, 0: as the number allows.
     """
 
     target: int
     cell_size: float | None
-    min_level: int
     max_level: int | None
-    surface_error: float
     min_layers: float
     wishes: Wishes
 
@@ -165,7 +165,7 @@ def chosen_meshes(domain: Domain, budget: Budget, sliver: float, device: wp.Devi
             best = meshes
         if budget.cell_size or NEAR_ENOUGH * budget.target <= count <= budget.target:
             break
-        if budget.surface_error and count <= budget.target:
+        if budget.wishes.surface_error and count <= budget.target:
             break
         if last and meshes.has_more and count <= budget.target:
             break
@@ -211,12 +211,12 @@ def _of_cubes(
     more = max(math.ceil(3.0 * math.log2(size / suits) - 0.5), 0)
     most = more + MAX_LEVEL + (target > MANY) if budget.max_level is None else budget.max_level
     deepest = more + MAX_LEVEL_THIN if budget.max_level is None else budget.max_level
-    looked = max(min(most + 1, CLOSE_LEVEL + more), min(deepest, budget.min_level))
-    error = max(CLOSE_ERROR * min(size, suits), 0.5 * budget.surface_error)
+    looked = max(min(most + 1, CLOSE_LEVEL + more), min(deepest, budget.wishes.min_level))
+    error = max(CLOSE_ERROR * min(size, suits), 0.5 * budget.wishes.surface_error)
     looking = replace(
         wishes,
         surface_error=error,
-        min_level=min(budget.min_level, looked),
+        min_level=min(budget.wishes.min_level, looked),
         max_level=looked,
         layers=budget.min_layers,
         thin_level=min(deepest, looked + CLOSER_LEVELS),
@@ -232,7 +232,7 @@ def _of_cubes(
     resolved = Resolved(growing.grown(), size, domain)
     needs = needs_of(resolved, domain, budget.min_layers, most, deepest)
     needs = resolved.largest(np.maximum(needs, floor_needs(resolved, points, largest, deepest))).astype(np.float32)
-    found = Meshes(resolved, needs, budget.surface_error, sliver)
+    found = Meshes(resolved, needs, budget.wishes.surface_error, sliver)
     found.choose(int(NEAR * target))
     return found
 
@@ -277,6 +277,12 @@ def needs_of(resolved: Resolved, domain: Domain, layers: float, most: int, deepe
     if layers > 0:
         thin = (resolved.thin(domain, layers) < layers * length) & (level < deepest)
         needs[thin] = np.maximum(needs[thin], THIN_NEED * length[thin])
+    gaps = resolved.gaps()
+    if gaps is not None:
+        # Pieces separate if elements of both, and one between them, have room; without room, bisection is in vain.
+        finest = resolved.cell_size * 0.5 ** (deepest / 3.0)
+        close = (GAP_ELEMENTS * length > gaps) & (gaps > GAP_ELEMENTS * finest) & (level < deepest)
+        needs[close] = np.maximum(needs[close], GAP_NEED * length[close])
     return resolved.largest(np.where(resolved.held > 0.0, needs, 0.0)).astype(np.float32)
 
 
@@ -315,8 +321,7 @@ def mesh_domain(
     if target_elements is not None:
         size = None if cell_size is None else float(cell_size)
         _check_cubes(domain, size, target_elements)
-        error = wishes.surface_error
-        budget = Budget(target_elements, size, min_level, max_level, error, float(min_layers), wishes)
+        budget = Budget(target_elements, size, max_level, float(min_layers), wishes)
         return _of_size(domain, budget, sliver, where)
     if cell_size is None:
         raise InputError("cell_size is None; it must be a length in metres where target_elements is not given")

@@ -23,8 +23,11 @@ if TYPE_CHECKING:
 #: A user's function of points [n, 3] -> [n].
 Field = Callable[[np.ndarray], np.ndarray]
 
-#: The assumed error of an element where the body is thinner than its layers, as a fraction of its edge.
-THIN_NEED = 0.4
+#: The assumed error of an element where the body is thinner than its layers, as a fraction of its edge; and the number
+#: of elements that must fit between pieces of the body so that these stay separate.
+THIN_NEED, GAP_ELEMENTS = 0.4, 2.0
+#: The need [m] of elements that are sampled finely only for thickness; it counts when the mesh is chosen.
+LOOKED = 1.0e-12
 #: Thickness is searched up to this multiple of the value it is compared with, because larger ones are cut off there.
 FARTHER = 1.01
 #: Elements with an error below this fraction of their edge need no finer sampling.
@@ -44,7 +47,7 @@ class Wishes:
         field: Function of points [n, 3] -> numbers [n]: elements in which it varies are bisected ...
         field_tolerance: ... by more than this.
         layers: Elements at the surface are bisected to level ``thin_level`` where the body is thinner than this many of
-            them.
+            them, or where its pieces are closer to each other.
     """
 
     surface_error: float
@@ -208,7 +211,7 @@ class Judge:
             growth.launch(kernels.judge_by_probes, len(chosen), inputs, [states, self.need])
 
     def judge_thickness(self, first: int, states: wp.array) -> None:
-        """Mark elements where the body is thinner than a few elements."""
+        """Mark elements where the body, or a gap between its pieces, is thinner than a few elements."""
         wishes, growth, domain = self.wishes, self.growth, self.domain
         if not wishes.layers or not len(states):
             return
@@ -218,22 +221,32 @@ class Judge:
         # Without a limit on their number, elements are not finer than the rest for this reason.
         deepest = wishes.thin_level if self.closer else wishes.max_level
         chosen = np.flatnonzero((state == kernels.DONE) & (leaf == LIVE) & (level < deepest))
-        # Thickness is accurate where the surface is.
-        chosen = chosen[self.need[first : growth.element_count].numpy()[chosen] <= self.closest[level[chosen]]]
+        # Thickness is accurate at the surface; gaps are only estimated, so any ray will do.
+        known = self.need[first : growth.element_count].numpy()[chosen] <= self.closest[level[chosen]]
+        if not domain.has_pieces:
+            chosen, known = chosen[known], known[known]
         tets = growth.tets[first : growth.element_count].numpy()[chosen]
         phi = self.phi.numpy()[tets]
         crossed = (phi < 0).any(axis=1) & (phi >= 0).any(axis=1)
-        chosen, tets, phi = chosen[crossed], tets[crossed], phi[crossed]
+        chosen, tets, phi, known = chosen[crossed], tets[crossed], phi[crossed], known[crossed]
         if not len(chosen):
             return
         x, inward = surface_points(growth.lattice.numpy()[tets], phi, np.asarray(self.origin), self.spacing)
         # By volume: a cube's edge halves in three levels.
         length = self.lengths[0] * 0.5 ** (level[chosen] / 3.0)
-        thin = wishes.layers * length > domain.thickness(x, inward, FARTHER * wishes.layers * float(length.max()))
+        reach = FARTHER * wishes.layers * float(length.max())
+        thin = known & (wishes.layers * length > domain.thickness(x, inward, reach))
         thin &= THIN_NEED * length > self.thin_tolerance
         need = np.where(thin, THIN_NEED * length, 0.0)
         limits = np.maximum(self.tolerances[level[chosen]], self.thin_tolerance) if self.limited else 0.0
-        split = thin & (THIN_NEED * length > limits)
+        wanted = THIN_NEED * length > limits
+        split = thin & wanted
+        if domain.has_pieces:
+            # Whether this is a gap between pieces is known later; then its need counts.
+            reach = FARTHER * GAP_ELEMENTS * float(length.max())
+            near = GAP_ELEMENTS * length > domain.thickness(x, inward, reach, outside=True)
+            need = np.where(near, np.maximum(need, LOOKED), need)
+            split |= near & (wanted | (not self.closer))
         state[chosen[split]] = kernels.SPLIT
         states.assign(state)
         needs = self.need.numpy()

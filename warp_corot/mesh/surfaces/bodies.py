@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 
 Forest = TypeVar("Forest", bound="ForestArrays")
 
+#: A node's way to a line is in the plane of its own cut if it is off by at most this share of its length.
+IN_PLANE = 0.02
 #: Nodes stay where they are if a cut is so nearly parallel to the face of a box: the square of the sine of the angle.
 LEAST = 0.1
 
@@ -174,7 +176,7 @@ def _moves_to_cuts(forest: ForestArrays, edges_of: SurfaceMesh) -> tuple[np.ndar
     An end and its way to the cut make a plane; if the other end has no such way, that of the point is across it.
     """
     weights = edges_of.weights[:, :2]
-    snap = np.asarray(forest.snap, np.float64)[edges_of.nodes[:, :2]]
+    snap = _shared_snaps(forest)[edges_of.nodes[:, :2]]
     squares = np.einsum("vnc,vnc->vn", snap, snap)
     shares = weights * (squares > 0.0)
     total = shares.sum(axis=1)
@@ -184,6 +186,26 @@ def _moves_to_cuts(forest: ForestArrays, edges_of: SurfaceMesh) -> tuple[np.ndar
     on_cut = np.zeros(len(snap), bool)
     on_cut[edges_of.triangles[edges_of.is_cut]] = True
     return np.where(total[:, None] < 0.999, planes, np.einsum("vn,vnc->vc", weights, snap)), on_cut
+
+
+def _shared_snaps(forest: ForestArrays) -> np.ndarray:
+    """The way from each node to the cuts there, float64 [N, 3]: of the nodes at one point the longest, which leads to
+    all cuts that meet there, so that there are no gaps between pieces.
+
+    Where two cuts meet too far away, nodes on one of them go their own way, so that both lips are flat.
+    """
+    snap = np.asarray(forest.snap, np.float64)
+    _, point = np.unique(forest.lattice[: len(snap)], axis=0, return_inverse=True)
+    point = point.ravel()
+    order = np.argsort(np.einsum("nc,nc->n", snap, snap), kind="stable")
+    longest = np.zeros(len(snap), np.int64)
+    longest[point[order]] = order
+    shared = snap[longest[point]]
+    off = np.einsum("nc,nc->n", shared - snap, snap)
+    stays = np.abs(off) <= IN_PLANE * np.linalg.norm(snap, axis=1) * np.linalg.norm(shared, axis=1)
+    ways = np.unique(np.column_stack([point, snap]), axis=0)[:, 0].astype(np.int64)
+    stays |= np.bincount(ways, minlength=len(snap))[point] > 2
+    return np.where(stays[:, None], shared, snap)
 
 
 def _within_faces(forest: ForestArrays, nodes: np.ndarray, moves: np.ndarray) -> np.ndarray:

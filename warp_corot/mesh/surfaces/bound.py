@@ -17,9 +17,8 @@ from warp_corot.inputs.checks import checked_indices, checked_numbers
 from warp_corot.kernels.meshing import embedding as kernels
 from warp_corot.kernels.meshing.embedding import find_holders
 from warp_corot.kernels.meshing.windings import find_nearest
-from warp_corot.mesh.lattice import LATTICE_BITS
 from warp_corot.mesh.topology import boundary_faces
-from warp_corot.mesh.tree import VOID, Tree
+from warp_corot.mesh.tree import Tree
 
 if TYPE_CHECKING:
     from warp_corot.mesh.forest_arrays import ForestArrays
@@ -81,10 +80,19 @@ def embed_in_tets(nodes: np.ndarray, tets: np.ndarray, points: np.ndarray) -> tu
     elements = found.numpy()
     outside = np.flatnonzero(elements < 0)
     if len(outside):
-        faces, parents = boundary_faces(tets, nodes)
-        elements[outside] = parents[nearest_faces(placed, faces, moved[outside], 10.0 * FARTHEST * size)]
+        elements[outside] = nearest_tets(nodes, tets, points[outside])
     later = np.einsum("nij,nj->ni", inverse[elements], points - middle - corners[elements, 0])
     return elements, np.column_stack([1.0 - later.sum(axis=1), later])
+
+
+def nearest_tets(nodes: np.ndarray, tets: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """The tetrahedron behind the boundary face that is closest to each point, int32 [n]."""
+    faces, parents = boundary_faces(tets, nodes)
+    # Relative to the centre of the mesh, because float32 keeps few digits far from zero.
+    middle, limit = nodes[faces].reshape(-1, 3).mean(axis=0), FARTHEST * float(np.ptp(nodes[faces], axis=(0, 1)).max())
+    moved = points - middle
+    moved *= limit / np.maximum(np.abs(moved).max(axis=1, keepdims=True), limit)
+    return parents[nearest_faces(nodes - middle, faces, moved, 10.0 * limit)]
 
 
 def nearest_faces(nodes: np.ndarray, faces: np.ndarray, points: np.ndarray, far: float) -> np.ndarray:
@@ -126,7 +134,7 @@ def embed(forest: ForestArrays, points: npt.ArrayLike) -> tuple[np.ndarray, np.n
     elements = number[found]
     outside = np.flatnonzero(elements < 0)
     if len(outside):
-        elements[outside] = _nearest_leaves(forest, points[outside])
+        elements[outside] = nearest_tets(forest.points, forest.tets, points[outside])
     return elements, barycentric(forest, elements, points)
 
 
@@ -167,35 +175,6 @@ def leaves_at(
     wp.launch(kernels.descend, len(within), inputs, [leaves], device=device)
     found[within] = leaves.numpy()
     return found
-
-
-def _nearest_leaves(forest: ForestArrays, points: np.ndarray) -> np.ndarray:
-    """The element behind the boundary face that is closest to each point, int32 [n]."""
-    faces, parents = _boundary_faces(forest)
-    # Relative to the centre of the mesh, because float32 keeps few digits far from zero.
-    middle = forest.points.mean(axis=0)
-    moved = points - middle
-    limit = FARTHEST * np.ptp(forest.points, axis=0).max()
-    moved *= limit / np.maximum(np.abs(moved).max(axis=1, keepdims=True), limit)
-    return parents[nearest_faces(forest.points - middle, faces, moved, 10.0 * limit)]
-
-
-def _boundary_faces(forest: ForestArrays) -> tuple[np.ndarray, np.ndarray]:
-    """Boundary faces and their leaves; the nodes of these faces are on void tetrahedra or on the border of the grid."""
-    tree = forest.tree
-    lattice = forest.lattice[: forest.node_count]
-    on_rim = ((lattice == 0) | (lattice == np.array(forest.cells) << LATTICE_BITS)).any(axis=1)
-    if forest.phi is not None:
-        # Void tetrahedra far outside may be non-conforming, but then no node on their faces is inside.
-        on_rim |= forest.phi[: forest.node_count] >= 0
-        of_void = tree.tets[tree.first_child == VOID]
-        of_void = of_void[(forest.phi[of_void] < 0).any(axis=1)]
-        on_rim[of_void[of_void < forest.node_count]] = True
-    near = np.flatnonzero(on_rim[forest.tets].sum(axis=1) >= 3)
-    faces, parents = boundary_faces(forest.tets[near], forest.points)
-    # Faces between near leaves and others only look like boundary faces.
-    real = on_rim[faces].all(axis=1)
-    return faces[real], near[parents[real]].astype(np.int32)
 
 
 #: The length of the mean of the normals at the points that a node bears, below which they lie on opposite sides; at a
