@@ -32,7 +32,8 @@ def strongest(mesh, device, fixed, obstacle, integrator):
 def test_a_brick_whose_held_half_lies_in_the_ground(device, steps):
     """The free half is bent up by the overlap of 1 mm, as a beam of 13 mm would be: nothing is thrown by more than
     twice that (before, 25 mm and 190 N)."""
-    most, last, moved = strongest(brick_mesh(), device, "x < 0", ground(-0.006), STEPS[steps])
+    # Bricks of 400 and 800 elements have so few places beside the held ones that the force varies threefold.
+    most, last, moved = strongest(brick_mesh(1500), device, "x < 0", ground(-0.006), STEPS[steps])
     # All of the bottom would be lifted by a mean stress of E u / h.
     assert most < SOFT.young * (0.001 / 0.014) * 0.026 * 0.022
     assert last > 0.1
