@@ -473,6 +473,7 @@ def gather_stiffness(threads: int, rows: ImplicitRows, stiffness: wp.array[wp.ma
 @wp.kernel(enable_backward=False)
 def scale_nodes(
     start: int,
+    first: int,
     is_after: int,
     surface: Surface,
     carriers: Carriers,
@@ -480,12 +481,15 @@ def scale_nodes(
     v: wp.array[wp.vec4],
 ):
     """v = G v, or G^T v before a preconditioner that knows no rows, where G makes the directions in which they are
-    stiff as small as that makes them: G G^T = (1 + D / k)^-1 with their stiffness D and that of the node, k."""
+    stiff as small as that makes them: G G^T = (1 + D / k)^-1 with their stiffness D and that of the node, k.
+
+    The vector v is that of one body, whose entries begin at ``first`` in those of all.
+    """
     s = start + wp.tid()
     if surface.node[s] < 0 or is_borne(s, surface) or wp.trace(stiffness[s]) <= 0.0:
         return
     g = root_columns(wp.inverse(wp.identity(n=3, dtype=float) + carriers.compliance[s] * stiffness[s]))
-    i = carriers.entry[s]
+    i = carriers.entry[s] - first
     x = load_node(v, i)
     store_node(v, i, wp.where(is_after != 0, g * x, wp.transpose(g) * x))
 

@@ -90,7 +90,7 @@ def test_help(args, capsys):
             assert f"--{name} " in said
 
 
-@pytest.mark.parametrize("stage", ["cli.subcommand", "inputs.starting.start_warp"])
+@pytest.mark.parametrize("stage", ["cli.subcommand", "inputs.processes.start_warp"])
 def test_interrupted_before_anything_runs(stage, capsys, monkeypatch):
     def interrupt(*_):
         raise KeyboardInterrupt

@@ -24,11 +24,14 @@ def plate():
 )
 def test_contact_surfaces_keep_their_shape(domain, elements):
     """Without smaller distances between points where they are needed, a ball of 60 elements touches up to a third of
-    an element inside its surface, and the ends of a vessel and a plate up to 0.8 of one."""
+    an element inside its surface, and the ends of a vessel and a plate up to 0.8 of one. Single points of a vessel's
+    rims stay up to a third of one away."""
     mesh = wc.TetForest.from_domain(domain, target_elements=elements)
     whole, thin = mesh.surface(), own_surface(mesh)
     size = (6.0 * mesh.volumes.mean()) ** (1.0 / 3.0)
-    assert distances_from(thin.points, thin.triangles, whole.points, 0.1).max() < 0.2 * size
+    far = distances_from(thin.points, thin.triangles, whole.points, 0.1)
+    assert far.max() < (0.33 if domain is VESSEL else 0.2) * size
+    assert np.sqrt((far**2).mean()) < 0.04 * size
     assert len(thin.points) < len(whole.points)
     assert thin.volume == pytest.approx(whole.volume, rel=0.06)
 

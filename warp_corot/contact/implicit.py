@@ -79,6 +79,8 @@ class ImplicitContact:
         self._rows.counts = wp.zeros(4, dtype=wp.int32, device=self.device)
         self.locates, self.solves = self._rows.locates, self._rows.solves
         self._made: tuple[int, int] = (-1, -1)
+        #: The first entry of each body in vectors of all bodies.
+        self._firsts = [0] * len(system.bodies)
         self.prepare()
 
     @property
@@ -187,7 +189,7 @@ class ImplicitContact:
             increment: How far held nodes have gone in the step [m], vec4.
             guess: How far free nodes may go [m], vec4.
         """
-        body = self._system.bodies[k]
+        body, self._firsts[k] = self._system.bodies[k], first
         start, offset, count, own = self._nodes_of(k)
         inputs = [start, offset, first, body.conditions.inverse_mass, blocks]
         inputs += [body.state.rest, body.state.displacements, increment, guess]
@@ -230,7 +232,7 @@ class ImplicitContact:
 
     def scale(self, k: int, v: wp.array, *, is_after: bool) -> None:
         """Launch v = G v with the springs at a body's nodes, or G^T v; see ``scale_nodes``."""
-        inputs = [self._surface.parts[k].start, int(is_after), self._surface.arrays, self._carriers]
+        inputs = [self._surface.parts[k].start, self._firsts[k], int(is_after), self._surface.arrays, self._carriers]
         wp.launch(kernels.scale_nodes, self.places_of(k), [*inputs, self._stiffness, v], device=self.device)
 
     def find_reached(self, d: wp.array, change: wp.array) -> None:
