@@ -242,8 +242,11 @@ class ImplicitContact:
     def add_slopes(
         self, d: wp.array, change: wp.array, search: wp.array, slopes: wp.array, *, apart: int | None = None
     ) -> None:
-        """Launch the power along a change; see ``solvers.implicit.line_search``. If there is only one slope, it is that
-        of all worlds together. With ``apart``, a body, there is one for each of its places, [worlds * places]."""
+        """Launch the power along a change; see ``solvers.implicit.conjugate_gradients``.
+
+        If there is only one slope, it is that of all worlds together. With ``apart``, a body, there is one for each of
+        its places, [worlds * places].
+        """
         first = -1 if apart is None else self._surface.parts[apart].start
         inputs = [int(len(search) == 1), first, *self._table, d, change, search, slopes]
         self._on_rows(kernels.add_row_slopes, inputs)

@@ -125,6 +125,26 @@ def pressed(scene, device, **options):
     return sim, tool
 
 
+def test_stiff_nodes_are_scaled_in_their_own_body(device, rng):
+    """The preconditioner of the second of two bodies gets a vector whose entries begin with that body's first node."""
+    sim, _ = pressed("soft surfaces", device)
+    sim.advance_steps(15)
+    (solve_of_step,) = sim.recorded._stepper._solves
+    system = solve_of_step._system
+    system.contact.update(system.x)
+    system.contact.update_springs()
+    v = on_device(rng.standard_normal((system.worlds * system.node_count, 3)), system)
+    before, blocks = v.numpy().copy(), system.blocks.of(v)
+    system.contact.scale(1, blocks[1], is_after=False)
+    changed = np.flatnonzero((v.numpy() != before).any(axis=1))
+    contact, at = system.contact, sim.contact.surface.places_of(1)
+    is_stiff = np.trace(contact._stiffness.numpy()[at], axis1=1, axis2=2) > 0.0
+    assert is_stiff.any()
+    np.testing.assert_array_equal(changed, np.sort(contact._carriers.entry.numpy()[at][is_stiff]))
+    # What the tool holds moves less.
+    assert (np.linalg.norm(v.numpy()[changed], axis=1) < np.linalg.norm(before[changed], axis=1)).all()
+
+
 @pytest.mark.parametrize("scene", ["held", "between nodes", "own surface", "soft surfaces"])
 def test_contact_is_in_the_matrix(scene, device, rng):
     """A and the sum of c c^T are what the operator does, and solves satisfy it. Where soft surfaces may meet, it is one

@@ -16,7 +16,6 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial.transform import Rotation
 
 from warp_corot.errors import InputError
 from warp_corot.inputs.checks import checked_vector
@@ -509,37 +508,6 @@ def check_ground(made: StageModel, builder: newton.ModelBuilder, height: float, 
         if bounds[0, axis] < height - 0.01 * (bounds[1, axis] - bounds[0, axis]):
             deep = (height - bounds[0, axis]) * metres
             warnings.warn(f"{path} begins {deep:.3g} m deep in the ground (--ground)", UserWarning, stacklevel=4)
-
-
-def warn_of_overlaps(made: StageModel, contacts: newton.Contacts) -> None:
-    """Warn of soft bodies that begin in colliders, from which contact will push them.
-
-    Args:
-        made: The stage's model.
-        contacts: Contacts of its initial state.
-    """
-    model, metres = made.model, made.scene.units.metres
-    count = min(int(contacts.soft_contact_count.numpy()[0]), contacts.soft_contact_max)
-    fields = (contacts.soft_contact_particle, contacts.soft_contact_shape, contacts.soft_contact_body_pos)
-    particle, shape, point = (array.numpy()[:count] for array in fields)
-    normal = contacts.soft_contact_normal.numpy()[:count].astype(np.float64)
-    x, point = model.particle_q.numpy().astype(np.float64)[particle], point.astype(np.float64)
-    owner = model.shape_body.numpy()[shape]
-    if (moving := owner >= 0).any():
-        pose = model.body_q.numpy().astype(np.float64)[owner[moving]]
-        point[moving] = Rotation.from_quat(pose[:, 3:]).apply(point[moving]) + pose[:, :3]
-    gap = np.einsum("ci,ci->c", normal, x - point) - model.particle_radius.numpy()[particle]
-    gap[model.particle_inv_mass.numpy()[particle] == 0.0] = np.inf
-    for body in made.soft:
-        inside = (particle >= body.particles.start) & (particle < body.particles.stop)
-        inside &= gap < -TOUCHING * body.edge / metres
-        for one in np.unique(shape[inside]):
-            deep = -gap[inside & (shape == one)].min() * metres
-            warnings.warn(
-                f"{body.prim.path} begins {deep:.3g} m deep in {model.shape_label[one]}, and contact will throw it out",
-                UserWarning,
-                stacklevel=3,
-            )
 
 
 def notes_of(made: StageModel, builder: newton.ModelBuilder, options: StageOptions) -> Iterator[str]:

@@ -22,7 +22,7 @@ from warp_corot.newton.library import newton
 from warp_corot.newton.solver import SolverCorotated
 from warp_corot.newton.substeps import INTERVAL, RETRIES
 
-from .stage import StageOptions, stage_model, warn_of_overlaps
+from .stage import TOUCHING, StageModel, StageOptions, stage_model
 
 #: Maximum number of steps that are recorded together, with one measurement; a frame is a whole number of chunks. On the
 #: CPU recording a step takes as long as ten steps.
@@ -275,3 +275,34 @@ class StageSimulation:
         state.clear_forces()
         self._pipeline.collide(state, self._contacts, soft_self_contact=self._touch)
         self.solver.step(state, state, None, self._contacts, self.dt)
+
+
+def warn_of_overlaps(made: StageModel, contacts: newton.Contacts) -> None:
+    """Warn of soft bodies that begin in colliders, from which contact will push them.
+
+    Args:
+        made: The stage's model.
+        contacts: Contacts of its initial state.
+    """
+    model, metres = made.model, made.scene.units.metres
+    count = min(int(contacts.soft_contact_count.numpy()[0]), contacts.soft_contact_max)
+    fields = (contacts.soft_contact_particle, contacts.soft_contact_shape, contacts.soft_contact_body_pos)
+    particle, shape, point = (array.numpy()[:count] for array in fields)
+    normal = contacts.soft_contact_normal.numpy()[:count].astype(np.float64)
+    x, point = model.particle_q.numpy().astype(np.float64)[particle], point.astype(np.float64)
+    owner = model.shape_body.numpy()[shape]
+    if (moving := owner >= 0).any():
+        pose = model.body_q.numpy().astype(np.float64)[owner[moving]]
+        point[moving] = Rotation.from_quat(pose[:, 3:]).apply(point[moving]) + pose[:, :3]
+    gap = np.einsum("ci,ci->c", normal, x - point) - model.particle_radius.numpy()[particle]
+    gap[model.particle_inv_mass.numpy()[particle] == 0.0] = np.inf
+    for body in made.soft:
+        inside = (particle >= body.particles.start) & (particle < body.particles.stop)
+        inside &= gap < -TOUCHING * body.edge / metres
+        for one in np.unique(shape[inside]):
+            deep = -gap[inside & (shape == one)].min() * metres
+            warnings.warn(
+                f"{body.prim.path} begins {deep:.3g} m deep in {model.shape_label[one]}, and contact will throw it out",
+                UserWarning,
+                stacklevel=3,
+            )
