@@ -121,7 +121,8 @@ class LawSimdField(LawField):
 @cache
 def law_of(terms: IsotropicLaw) -> Law:
     """Ogden's law of some terms."""
-    return Law(*law_functions(bare(terms).code), terms)
+    stress, differential, energy = law_functions(bare(terms).code)
+    return Law(stress, differential, energy, terms)
 
 
 def law_field(law: Law, discretization: Discretization, deterministic: bool = False) -> LawField:
