@@ -1,5 +1,5 @@
-"""Exchanges of arrays' entries between ranks, through the host's memory or NCCL, and between a body and its part; and
-sums over ranks that are the same bit for bit for any number of ranks.
+"""Exchanges of arrays' entries between ranks, through the host's memory, cards' memory or NCCL, and between a body and
+its part; and sums over ranks that are the same bit for bit for any number of ranks.
 
 NCCL is imported here only.
 """
@@ -7,6 +7,7 @@ NCCL is imported here only.
 from __future__ import annotations
 
 import functools
+import socket
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -18,6 +19,7 @@ import warp as wp
 
 from warp_corot.errors import InputError
 from warp_corot.kernels.distributed import exchange as kernels
+from warp_corot.kernels.distributed import peers
 
 from . import mpi
 
@@ -29,6 +31,8 @@ Room = dict[int, npt.NDArray[Any]]
 #: Bits of the whole numbers into which addends are split, so that sums of 2**32 of them fit into int64; and the binary
 #: logarithm of the smallest unit.
 BITS, LEAST_POWER = 30, -1020
+#: Words from whose multiples arrays begin in memory that cards share, and those that make an allocation of its own.
+ALIGNED, OWN_WORDS = 32, 1 << 19
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,7 +159,7 @@ def nccl_of(alias: str) -> Any:
 
 
 class CardExchange:
-    """The exchange of a part's nodal values between cards.
+    """The exchange of a part's nodal values between cards: through NCCL, or see ``PeerExchange``.
 
     Args:
         halo: The lists of nodes to send and to receive.
@@ -163,12 +167,16 @@ class CardExchange:
         kinds: The types of values that it exchanges.
     """
 
-    def __init__(self, halo: ExchangeLists, device: wp.Device, kinds: Sequence[Any] = kernels.EXCHANGED):
-        self._nccl, self._device = nccl_of(device.alias), device
+    def __init__(self, halo: ExchangeLists, device: wp.Device, kinds: Sequence[Any]):
+        self._device = device
         self._sent, self._received = (_joined(lists, device) for lists in (halo.sent, halo.received))
         #: The stream on which it runs beside other launches, with a higher priority.
         self.aside = wp.Stream(device, priority=-1)
         self.is_under_way = False
+        self._prepare(kinds)
+
+    def _prepare(self, kinds: Sequence[Any]) -> None:
+        self._nccl = nccl_of(self._device.alias)
         self._rooms = {kind: self._room_for(kind) for kind in kinds}
 
     def launch(self, nodal: wp.array) -> None:
@@ -211,6 +219,73 @@ class CardExchange:
             wp.zeros(len(nodes), dtype=kind, device=self._device) for nodes in (self._sent[0], self._received[0])
         )
         return out, given
+
+
+class PeerExchange(CardExchange):
+    """The same between cards of one machine that reach one another's memory: one launch, ``kernels.distributed.peers``.
+
+    All ranks must make it together. A rank that sends to another one also receives from it, if only the number of the
+    exchange: then a card is never two exchanges ahead of a neighbour.
+    """
+
+    def _prepare(self, kinds: Sequence[Any]) -> None:
+        comm, device = mpi.world(), self._device
+        (nodes, by), (_, to) = self._received, self._sent
+        neighbours = sorted({rank for rank, *_ in (*by, *to)})
+        widths = {kind: wp.types.type_size_in_bytes(kind) // 4 for kind in kinds}
+        # What neighbours write: their counts, then the values of each kind, twice.
+        begins, end = {}, -(-len(neighbours) // ALIGNED) * ALIGNED
+        for kind, width in widths.items():
+            begins[kind], end = end, end + -(-2 * width * len(nodes) // ALIGNED) * ALIGNED
+        with wp.ScopedMempool(device, False):
+            # An allocation of its own, which the driver shares with no other.
+            self._shared = wp.zeros(-(-max(end, 1) // OWN_WORDS) * OWN_WORDS, dtype=wp.uint32, device=device)
+        wp.synchronize_device(device)
+        places = {rank: (neighbours.index(rank), 0) for rank in neighbours}
+        places |= {rank: (neighbours.index(rank), start) for rank, start, _ in by}
+        everybody = comm.allgather((self._shared.ipc_handle(), places, list(begins.values()), len(nodes)))
+        self._theirs = {
+            rank: wp.from_ipc_handle(everybody[rank][0], wp.uint32, self._shared.shape, device=device)
+            for rank in neighbours
+        }
+        signals = [self._theirs[rank].ptr + 4 * everybody[rank][1][comm.rank][0] for rank in neighbours]
+        self._signals = wp.array(np.array(signals, np.uint64), dtype=wp.uint64, device=device)
+        self._arrived = self._shared[: len(neighbours)]
+        self._clock = wp.zeros(peers.CLOCK, dtype=wp.uint32, device=device)
+        self._ways = {}
+        for k, (kind, width) in enumerate(widths.items()):
+            targets = [np.zeros((2, 0), np.int64)]
+            for rank, start, end in to:
+                _, their_places, their_begins, their_count = everybody[rank]
+                first = their_begins[k] + width * (their_places[comm.rank][1] + np.arange(end - start))
+                targets.append(self._theirs[rank].ptr + 4 * (first + width * their_count * np.arange(2)[:, None]))
+            room = self._shared[begins[kind] : begins[kind] + 2 * width * len(nodes)].reshape((2, width * len(nodes)))
+            addresses = np.concatenate(targets, axis=1).astype(np.uint64)
+            self._ways[kind] = width, wp.array(addresses, dtype=wp.uint64, device=device), room
+        most = max([len(self._sent[0]), len(nodes)]) * max(widths.values(), default=0)
+        self._blocks = min(max(-(-most // peers.BLOCK), 1), peers.MOST_BLOCKS) if neighbours else 0
+        # No card may write before all have cleared their memory.
+        comm.Barrier()
+
+    def launch(self, nodal: wp.array) -> None:
+        width, targets, room = self._ways[nodal.dtype]
+        words = wp.array(ptr=nodal.ptr, dtype=wp.uint32, shape=(nodal.size, width), device=self._device)
+        (received, _), (sent, _) = self._received, self._sent
+        inputs = [width, sent, targets, self._signals, received, room, self._arrived]
+        threads = peers.BLOCK * self._blocks
+        wp.launch(peers.exchange, threads, inputs, [self._clock, words], device=self._device, block_dim=peers.BLOCK)
+
+
+@functools.cache
+def are_peers(alias: str) -> bool:
+    """Whether all ranks' cards, of which this one has this name, reach one another's memory; all ranks must ask."""
+    comm, device = mpi.world(), wp.get_device(alias)
+    cards = comm.allgather((socket.gethostname(), alias))
+    mine = all(
+        host == socket.gethostname() and (name == alias or wp.is_peer_access_supported(name, device))
+        for host, name in cards
+    )
+    return all(comm.allgather(mine and device.is_ipc_supported is not False))
 
 
 def reduce_on_cards(values: wp.array, operation: str) -> None:

@@ -15,7 +15,16 @@ from warp_corot.kernels.distributed import exchange as kernels
 from warp_corot.solvers.halo import Floats, Halo, Owned, V
 
 from .divided_mesh import DividedMesh
-from .exchange import CardExchange, ExchangeLists, HostExchange, in_worlds, reduce_on_cards, reproducible_sums
+from .exchange import (
+    CardExchange,
+    ExchangeLists,
+    HostExchange,
+    PeerExchange,
+    are_peers,
+    in_worlds,
+    reduce_on_cards,
+    reproducible_sums,
+)
 from .multigrid import MultigridOfParts, has_multigrid
 from .part import Part
 
@@ -138,8 +147,11 @@ class MpiHalo(CommHalo):
     def exchange_of(
         self, lists: ExchangeLists, tag: int, kinds: Sequence[Any] = kernels.EXCHANGED
     ) -> HostExchange | CardExchange:
-        """The exchange for some lists of places on this rank's device, of values of these types."""
-        return CardExchange(lists, self.device, kinds) if self.device.is_cuda else HostExchange(lists, self.comm, tag)
+        """The exchange for some lists of places on this rank's device, of values of these types; all ranks must
+        call."""
+        if not self.device.is_cuda:
+            return HostExchange(lists, self.comm, tag)
+        return (PeerExchange if are_peers(self.device.alias) else CardExchange)(lists, self.device, kinds)
 
     def owned(self, body: SoftBody) -> Owned:
         return self._owned[body]
