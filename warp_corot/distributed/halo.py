@@ -22,6 +22,7 @@ from .exchange import (
     PeerExchange,
     are_peers,
     in_worlds,
+    nccl_of,
     reduce_on_cards,
     reproducible_sums,
 )
@@ -134,6 +135,9 @@ class MpiHalo(CommHalo):
         super().__init__(comm)
         self.is_reproducible, self._parts = reproducible, parts
         self.device = parts[0].device
+        if self.device.is_cuda:
+            # Sums and maxima are recorded; NCCL must have begun before.
+            nccl_of(self.device.alias)
         self.lists = [ExchangeLists.of(p.numbers.nodes, p.numbers.owner, p.worlds, comm) for p in parts]
         self._exchanges = [self.exchange_of(lists, k) for k, lists in enumerate(self.lists)]
         self._connected = len(parts)
