@@ -23,6 +23,7 @@ from warp_corot.kernels.elements.elements import (
 )
 from warp_corot.kernels.elements.forces import in_local_frame, own_gradient
 from warp_corot.kernels.elements.shapes import leaf_forces_of
+from warp_corot.kernels.elements.simd8 import law_kernel
 from warp_corot.kernels.math.matrices import identity3
 from warp_corot.kernels.modules import unique_kernel
 from warp_corot.kernels.subtrees.forces import mat10
@@ -144,7 +145,7 @@ def keep_rows(shape: int, of: Dilatation) -> wp.Kernel:
     leaves = LEAVES[shape]
     measure, curvature_of = of.measure, of.curvature
 
-    @unique_kernel()
+    @law_kernel()
     def keep_rows(
         # In
         count: int,
