@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-import warp as wp
 from remesh_cases import random_marks
 from remeshed import SOFT
 from tree_levels import TreeLevels
@@ -166,14 +165,3 @@ def test_general_meshes_have_no_levels(device):
     body = wc.SoftBody(wc.TetMesh(box.points, box.tets), SOFT, device=device)
     with pytest.raises(wc.InputError, match="only a TetForest has levels; this mesh is a TetMesh"):
         body.discretization.levels()
-
-
-def test_levels_and_arrays_that_do_not_fit_are_refused(device):
-    levels = body_of("uniform", device, worlds=2).discretization.levels()
-    x = wp.zeros(2 * levels.node_count, dtype=wp.vec4, device=device)
-    for transfer in (levels.prolongate, levels.restrict):
-        for coarse, fine in ((-1, 3), (4, 3), (0, levels.depth + 1)):
-            with pytest.raises(wc.InputError, match="they must be in order, from 0 to 7"):
-                transfer(x, coarse, fine)
-        with pytest.raises(wc.InputError, match=f"it must have 2 \\* {levels.node_count}"):
-            transfer(x[:-1])
