@@ -65,6 +65,42 @@ class ContactEntries:
     beside: wp.array[wp.int32]  # the contacts, as products, that have no entries
 
 
+@wp.struct
+class Solve:
+    """The matrix of a solve, and its vectors; see ``native/ssor_cg.h`` and ``native/persistent_cg.h``."""
+
+    worlds: int
+    count: int
+    entries: int
+    per_team: int
+    lanes: int
+    most: int
+    rows: Rows
+    planes: wp.array[wp.float32]
+    diagonal: wp.array[wp.int32]
+    inverses: wp.array[wp.mat33]
+    pivots: wp.array[wp.mat33]
+    couplings: Couplings
+    of_contacts: ContactEntries
+    # In and out
+    x: wp.array[wp.vec4]
+    r: wp.array[wp.vec4]
+    scalars: wp.array2d[wp.float64]
+    status: wp.array[wp.int32]
+    iterations: wp.array[wp.int32]
+    # Work
+    u: wp.array[wp.vec4]
+    p: wp.array[wp.vec4]
+    q: wp.array[wp.vec4]
+    s: wp.array[wp.vec4]
+    added: wp.array[wp.vec4]
+    parts: wp.array[wp.float64]
+    barriers: wp.array[wp.uint32]
+    # On the CPU
+    division: Division
+    team: wp.uint64
+
+
 # --- the matrix -------------------------------------------------------------------------------------------------------
 
 
@@ -77,9 +113,17 @@ def write_planes(world: int, k: int, entries: int, block: wp.mat33, planes: wp.a
 
 
 @wp.kernel(enable_backward=False)
-def lay_out(entries: int, blocks: wp.array[wp.mat33], planes: wp.array[wp.float32]):
+def lay_out(solve: Solve):
     world, k = wp.tid()
-    write_planes(world, k, entries, blocks[world * entries + k], planes)
+    write_planes(world, k, solve.entries, solve.rows.blocks[world * solve.entries + k], solve.planes)
+
+
+@wp.kernel(enable_backward=False)
+def keep_diagonal(solve: Solve, plain: wp.array[wp.mat33]):
+    """Keep the diagonal by node."""
+    world, k = wp.tid()
+    block = solve.rows.blocks[world * solve.entries + solve.diagonal[k]]
+    plain[world * solve.count + solve.division.nodes[k]] = block
 
 
 @wp.kernel(enable_backward=False)
@@ -87,26 +131,18 @@ def finish_matrix(
     # In
     begin: int,
     is_new: int,
-    count: int,
-    entries: int,
-    nodes: wp.array[wp.int32],
-    diagonal: wp.array[wp.int32],
     plain: wp.array[wp.mat33],
-    couplings: Couplings,
     # In and out
     marks: wp.array[wp.int32],
-    # Out
-    blocks: wp.array[wp.mat33],
-    pivots: wp.array[wp.mat33],
-    inverses: wp.array[wp.mat33],
-    planes: wp.array[wp.float32],
+    solve: Solve,
 ):
     """From the row ``begin`` on: the diagonal with contacts of one node; with all contacts; and the inverse of that.
     Unless the matrix ``is_new``, only rows that contact changes, or has changed: ``marks`` says which."""
     world, k = wp.tid()
     k += begin
-    i = world * count + k
-    node = world * count + nodes[k]
+    i = world * solve.count + k
+    node = world * solve.count + solve.division.nodes[k]
+    couplings = solve.couplings
     touches = wp.trace(couplings.single[node]) > 0.0 or wp.trace(couplings.blocks[node]) > 0.0
     if is_new == 0 and not touches and marks[i] == 0:
         return
@@ -119,25 +155,11 @@ def finish_matrix(
         whole = own + couplings.blocks[node]
         whole = 0.5 * (whole + wp.transpose(whole))
         inverse = inverse_block(whole)
-        blocks[world * entries + diagonal[k]] = own
-        if planes.shape[0] > 1:
-            write_planes(world, diagonal[k], entries, own, planes)
-    pivots[i] = whole
-    inverses[i] = inverse
-
-
-@wp.kernel(enable_backward=False)
-def keep_diagonal(
-    count: int,
-    entries: int,
-    nodes: wp.array[wp.int32],
-    diagonal: wp.array[wp.int32],
-    blocks: wp.array[wp.mat33],
-    plain: wp.array[wp.mat33],
-):
-    """Keep the diagonal by node."""
-    world, k = wp.tid()
-    plain[world * count + nodes[k]] = blocks[world * entries + diagonal[k]]
+        solve.rows.blocks[world * solve.entries + solve.diagonal[k]] = own
+        if solve.planes.shape[0] > 1:
+            write_planes(world, solve.diagonal[k], solve.entries, own, solve.planes)
+    solve.pivots[i] = whole
+    solve.inverses[i] = inverse
 
 
 # --- contacts ---------------------------------------------------------------------------------------------------------
@@ -219,17 +241,10 @@ def add_entry(row: int, column: int, block: wp.mat33, found: ContactEntries):
 
 
 @wp.kernel(enable_backward=False)
-def add_entries(
-    # In
-    count: int,
-    per_team: int,
-    division: Division,
-    couplings: Couplings,
-    # Out
-    found: ContactEntries,
-):
+def add_entries(per_team: int, solve: Solve):
     """Write the products of contacts as entries of rows; in one thread. Contacts that couple rows of two threads which
     sweep at the same time, or for which there may be no room, stay ``beside`` the rows. Lists must be empty."""
+    count, division, couplings, found = solve.count, solve.division, solve.couplings, solve.of_contacts
     found.count[0] = 0
     found.beside_count[0] = 0
     for c in range(wp.min(couplings.count[0], couplings.nodes.shape[0])):
@@ -279,106 +294,24 @@ _NUMBERS = constants(
 )
 
 
+_FIELDS = "".join(f"auto& {name} = solve.{name};\n" for name in Solve.vars if name != "team")
+
+
 @wp.func_native(
-    on_cpu(_NUMBERS, "const address team = team_at;\n", native("ssor_cg"), otherwise=_NUMBERS + native("persistent_cg"))
+    on_cpu(
+        _NUMBERS,
+        _FIELDS,
+        "const address team = solve.team;\n",
+        native("ssor_cg"),
+        otherwise=_NUMBERS + _FIELDS + native("persistent_cg"),
+    )
 )
-def solve_rows(
-    world: int,
-    worlds: int,
-    count: int,
-    entries: int,
-    per_team: int,
-    lanes: int,
-    most: int,
-    rows: Rows,
-    planes: wp.array[wp.float32],
-    diagonal: wp.array[wp.int32],
-    inverses: wp.array[wp.mat33],
-    pivots: wp.array[wp.mat33],
-    couplings: Couplings,
-    of_contacts: ContactEntries,
-    x: wp.array[wp.vec4],
-    r: wp.array[wp.vec4],
-    scalars: wp.array2d[wp.float64],
-    status: wp.array[wp.int32],
-    iterations: wp.array[wp.int32],
-    u: wp.array[wp.vec4],
-    p: wp.array[wp.vec4],
-    q: wp.array[wp.vec4],
-    s: wp.array[wp.vec4],
-    added: wp.array[wp.vec4],
-    parts: wp.array[wp.float64],
-    barriers: wp.array[wp.uint32],
-    division: Division,
-    team_at: wp.uint64,
-): ...
+def solve_rows(world: int, solve: Solve): ...
 
 
 @unique_kernel(native=headers("team"))
-def solve(
-    # In
-    worlds: int,
-    count: int,
-    entries: int,
-    per_team: int,
-    lanes: int,
-    most: int,
-    rows: Rows,
-    planes: wp.array[wp.float32],
-    diagonal: wp.array[wp.int32],
-    inverses: wp.array[wp.mat33],
-    pivots: wp.array[wp.mat33],
-    couplings: Couplings,
-    of_contacts: ContactEntries,
-    # In and out
-    x: wp.array[wp.vec4],
-    r: wp.array[wp.vec4],
-    scalars: wp.array2d[wp.float64],
-    status: wp.array[wp.int32],
-    # Out
-    iterations: wp.array[wp.int32],
-    # Work
-    u: wp.array[wp.vec4],
-    p: wp.array[wp.vec4],
-    q: wp.array[wp.vec4],
-    s: wp.array[wp.vec4],
-    added: wp.array[wp.vec4],
-    parts: wp.array[wp.float64],
-    barriers: wp.array[wp.uint32],
-    # On the CPU
-    division: Division,
-    team_at: wp.uint64,
-):
+def solve(solve: Solve):
     """Iterate from the residual r of x until it is small enough: on the CPU in one thread, which shares the work with
     its team, on CUDA by resident blocks.
     """
-    solve_rows(
-        wp.tid(),
-        worlds,
-        count,
-        entries,
-        per_team,
-        lanes,
-        most,
-        rows,
-        planes,
-        diagonal,
-        inverses,
-        pivots,
-        couplings,
-        of_contacts,
-        x,
-        r,
-        scalars,
-        status,
-        iterations,
-        u,
-        p,
-        q,
-        s,
-        added,
-        parts,
-        barriers,
-        division,
-        team_at,
-    )
+    solve_rows(wp.tid(), solve)

@@ -1,4 +1,4 @@
-"""Nodes of a forest by tree level, found only from their lattice points, and the tables for transfers.
+"""Nodes of a forest by tree level, found only from their lattice points.
 
 A node is the midpoint of the refinement edge of a tetrahedron one level up, or a corner of a root. Let t be the
 smallest number of trailing zero bits of the nonzero coordinates of its lattice point. Three levels halve the edges, and
@@ -10,11 +10,7 @@ numbering; the nodes of leaves are 0 ... N - 1."""
 
 import warp as wp
 
-from warp_corot.kernels.elements.elements import LEVEL_MASK
-
 wp.set_module_options({"enable_backward": False})
-
-LOW_HALF = wp.constant(wp.int64((1 << 32) - 1))
 
 
 @wp.func
@@ -119,15 +115,11 @@ def list_ends(
     mesh_ends: wp.array[wp.vec2i],
     sums: wp.array[wp.int32],
     places: wp.array[wp.int32],
-    level: wp.array[wp.int32],
     nodes: wp.array[wp.int32],
     # Out
     ends: wp.array[wp.vec2i],
-    keys: wp.array[wp.int64],
-    midpoints: wp.array[wp.int32],
 ):
-    """Both ends of each node in the order of levels, the first ``roots`` nodes without any; for each end, level and end
-    as a key, and the midpoint."""
+    """Both ends of each node in the order of levels, the first ``roots`` nodes without any."""
     i = wp.tid()
     node = nodes[i]
     if i < roots:
@@ -140,12 +132,6 @@ def list_ends(
     a = number_of(pair[0], others, mesh_nodes, sums)
     b = number_of(pair[1], others, mesh_nodes, sums)
     ends[i] = wp.vec2i(a, b)
-    at = 2 * (i - roots)
-    high = wp.int64(level[i]) << wp.int64(32)
-    keys[at] = high | wp.int64(a)
-    keys[at + 1] = high | wp.int64(b)
-    midpoints[at] = node
-    midpoints[at + 1] = node
 
 
 @wp.kernel(enable_backward=False)
@@ -160,96 +146,3 @@ def flag_first(
     flags[i] = 1
     if i > 0 and keys[i - 1] == keys[i]:
         flags[i] = 0
-
-
-@wp.kernel(enable_backward=False)
-def find_coarse_starts(
-    # In
-    roots: int,
-    starts: wp.array[wp.int32],
-    sums: wp.array[wp.int32],
-    # Out
-    coarse_starts: wp.array[wp.int32],
-):
-    """The start of each level's coarser nodes, one for each flag; the last entry is their number."""
-    level = wp.tid()
-    before = 2 * (wp.max(starts[level], roots) - roots)
-    coarse_starts[level] = 0
-    if before > 0:
-        coarse_starts[level] = sums[before - 1]
-
-
-@wp.kernel(enable_backward=False)
-def name_coarse(
-    # In
-    keys: wp.array[wp.int64],
-    midpoint_starts: wp.array[wp.int32],
-    # Out
-    coarse: wp.array[wp.int32],
-):
-    i = wp.tid()
-    coarse[i] = int(keys[midpoint_starts[i]] & LOW_HALF)
-
-
-@wp.kernel(enable_backward=False)
-def finest_of_leaves(
-    # In
-    tets: wp.array[wp.vec4i],
-    code: wp.array[wp.int32],
-    # Out
-    finest: wp.array[wp.int32],
-):
-    """The finest level of the leaves around each node; ``code`` as in ``elements.elements.ForestElements``."""
-    i = wp.tid()
-    level = code[i] & LEVEL_MASK
-    for n in range(4):
-        wp.atomic_max(finest, tets[i][n], level)
-
-
-@wp.kernel(enable_backward=False)
-def finest_of_edges(
-    # In
-    roots: int,
-    level: wp.array[wp.int32],
-    ends: wp.array[wp.vec2i],
-    # Out
-    finest: wp.array[wp.int32],
-):
-    """The finest level of the tetrahedra that were bisected at an edge with the node as an end."""
-    i = roots + wp.tid()
-    for n in range(2):
-        wp.atomic_max(finest, ends[i][n], level[i] - 1)
-
-
-@wp.kernel(enable_backward=False)
-def average_ends(
-    # In
-    world_nodes: int,
-    nodes: wp.array[wp.int32],
-    ends: wp.array[wp.vec2i],
-    # In and out
-    x: wp.array[wp.vec4],
-):
-    """The mean of both ends at each node of a level."""
-    world, i = wp.tid()
-    first = world * world_nodes
-    x[first + nodes[i]] = 0.5 * (x[first + ends[i][0]] + x[first + ends[i][1]])
-
-
-@wp.kernel(enable_backward=False)
-def gather_midpoints(
-    # In
-    world_nodes: int,
-    coarse: wp.array[wp.int32],
-    starts: wp.array[wp.int32],
-    midpoints: wp.array[wp.int32],
-    # In and out
-    y: wp.array[wp.vec4],
-):
-    """Add half of the values at a level's nodes to the ends of their edges; ``starts`` has one more entry."""
-    world, i = wp.tid()
-    first = world * world_nodes
-    total = wp.vec4(0.0)
-    for at in range(starts[i], starts[i + 1]):
-        total += y[first + midpoints[at]]
-    y[first + coarse[i]] += 0.5 * total

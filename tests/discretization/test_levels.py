@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-import warp as wp
 from remesh_cases import random_marks
 from remeshed import SOFT
 from tree_levels import TreeLevels
@@ -95,7 +94,7 @@ def places_of(levels):
 
 
 def assert_equals_the_tree(levels, body):
-    """Levels, ends and finest levels equal those found by walking down the tree, and every order is deterministic."""
+    """Levels and ends equal those found by walking down the tree, and every order is deterministic."""
     lattice, tree = lattice_and_tree(body)
     expected = TreeLevels.of(tree, len(lattice))
     places, order, starts = places_of(levels), levels.nodes.numpy(), levels.starts
@@ -110,56 +109,12 @@ def assert_equals_the_tree(levels, body):
     ends = levels.ends.numpy()
     assert (ends[: starts[1]] == -1).all()
     assert np.array_equal(np.sort(places[ends[starts[1] :]], axis=1), expected.ends[places[order[starts[1] :]]])
-    assert np.array_equal(levels.finest.numpy(), expected.finest[places])
-    assert_gathers_every_end(levels)
-
-
-def assert_gathers_every_end(levels):
-    """Each level gathers from its own nodes, each at both of its ends, in the order of their numbers."""
-    order, ends, coarse = levels.nodes.numpy(), levels.ends.numpy(), levels.coarse.numpy()
-    where, midpoints = levels.midpoint_starts.numpy(), levels.midpoints.numpy()
-    assert levels.coarse_starts[:2] == (0, 0)
-    assert where[-1] == len(midpoints)
-    assert len(where) == len(coarse) + 1 == levels.coarse_starts[-1] + 1
-    for level in range(1, levels.depth + 1):
-        part = slice(levels.starts[level], levels.starts[level + 1])
-        rows = range(levels.coarse_starts[level], levels.coarse_starts[level + 1])
-        assert np.array_equal(coarse[rows], np.unique(ends[part]))
-        for row in rows:
-            expected = np.sort(order[part][(ends[part] == coarse[row]).any(axis=1)])
-            assert np.array_equal(midpoints[where[row] : where[row + 1]], expected)
-
-
-def nodal(values, device):
-    return wp.array(values.astype(np.float32), dtype=wp.vec4, device=device)
-
-
-def assert_prolongates_linear_functions(levels, lattice):
-    """Prolongation from every level to all finer nodes: lattice coordinates exactly, others to rounding."""
-    points = lattice[places_of(levels)].astype(float)
-    gradient = np.random.default_rng(3).standard_normal((3, 4))
-    linear = 0.5 + points @ (gradient / points.max())
-    level = np.empty(levels.node_count, int)
-    level[levels.nodes.numpy()] = np.repeat(np.arange(levels.depth + 1), np.diff(levels.starts))
-    for coarse in range(levels.depth + 1):
-        for values, atol in ((np.column_stack([points, points[:, 0]]), 0.0), (linear, 8 * ROUNDING)):
-            given = np.where(level[:, None] <= coarse, values, np.nan)
-            x = nodal(np.tile(given, (levels.worlds, 1)), levels.device)
-            levels.prolongate(x, coarse)
-            expected = np.tile(values, (levels.worlds, 1))
-            np.testing.assert_allclose(x.numpy(), expected, rtol=0, atol=atol * np.abs(values).max())
 
 
 @forests
 def test_levels_and_ends_are_the_trees(name, device):
     body = body_of(name, device)
     assert_equals_the_tree(body.discretization.levels(), body)
-
-
-@forests
-def test_linear_functions_are_prolongated_exactly(name, device):
-    body = body_of(name, device)
-    assert_prolongates_linear_functions(body.discretization.levels(), body.mesh.lattice)
 
 
 @pytest.mark.parametrize("name", ["sphere", "labels"])
@@ -179,8 +134,6 @@ def test_levels_follow_a_mesh_that_changes(name, device, rng):
         assert removed
         levels = body.discretization.levels()
         assert_equals_the_tree(levels, body)
-        lattice, _ = lattice_and_tree(body)
-        assert_prolongates_linear_functions(levels, lattice)
         assert (levels.node_count > levels.mesh_nodes) == (name != "mixed")
         # The pools also store the ends of each node.
         places, made = places_of(levels), slice(levels.starts[1], None)
@@ -201,62 +154,10 @@ def test_levels_are_found_once_for_each_mesh(device, rng):
     assert np.array_equal(back.nodes.numpy(), first.nodes.numpy())
 
 
-@pytest.mark.parametrize("name", ["mixed", "sphere"])
-def test_restriction_is_the_transpose(name, device, rng):
-    """Against dense float64 matrices, between any two levels, in two worlds at once."""
-    body = body_of(name, device, worlds=2)
-    levels, (lattice, tree) = body.discretization.levels(), lattice_and_tree(body)
-    expected, places = TreeLevels.of(tree, len(lattice)), places_of(levels)
-    level = expected.level[places]
-    x, y = rng.standard_normal((2, 2, levels.node_count, 4))
-    for coarse, fine in ((0, levels.depth), (0, 3), (3, 6), (4, 5), (6, levels.depth), (5, 5)):
-        matrix = expected.prolongation(places, coarse, fine)
-        known, found = level <= coarse, level <= fine
-        down, up = nodal(y.reshape(-1, 4), device), nodal(x.reshape(-1, 4), device)
-        levels.prolongate(up, coarse, fine)
-        levels.restrict(down, coarse, fine)
-        up, down = (a.numpy().reshape(2, -1, 4) for a in (up, down))
-        np.testing.assert_allclose(up[:, found], (matrix @ x)[:, found], rtol=0, atol=4 * ROUNDING * np.abs(x).max())
-        summed = matrix.T @ np.where(found[:, None], y, 0.0)
-        np.testing.assert_allclose(down[:, known], summed[:, known], rtol=0, atol=16 * ROUNDING * np.abs(summed).max())
-        # Nodes beyond both levels keep their values.
-        np.testing.assert_array_equal(up[:, ~found], x[:, ~found].astype(np.float32))
-        np.testing.assert_array_equal(down[:, ~found], y[:, ~found].astype(np.float32))
-
-
-@pytest.mark.parametrize("name", ["uniform", "labels"])
-def test_inner_products_are_those_of_transposed_operators(name, device, rng):
-    levels = body_of(name, device).discretization.levels()
-    x, y = rng.standard_normal((2, levels.node_count, 4)).astype(np.float32)
-    for coarse in (0, 3, levels.depth - 1):
-        known = levels.nodes.numpy()[: levels.starts[coarse + 1]]
-        up, down = nodal(x, device), nodal(y, device)
-        levels.prolongate(up, coarse)
-        levels.restrict(down, coarse)
-        one = (up.numpy().astype(float) * y).sum()
-        other = (x[known].astype(float) * down.numpy()[known]).sum()
-        size = float(np.linalg.norm(up.numpy()) * np.linalg.norm(y))
-        assert one == pytest.approx(other, abs=4 * float(ROUNDING) * size)
-
-
 def test_worlds_share_the_tables(device):
     one, three = (body_of("sphere", device, worlds).discretization.levels() for worlds in (1, 3))
-    for name in ("others", "nodes", "ends", "finest", "coarse", "midpoint_starts", "midpoints"):
+    for name in ("others", "nodes", "ends"):
         assert np.array_equal(getattr(one, name).numpy(), getattr(three, name).numpy()), name
-    assert_prolongates_linear_functions(three, FORESTS["sphere"]().lattice)
-
-
-def test_transfers_can_be_recorded(device, rng):
-    levels = body_of("mixed", device).discretization.levels()
-    values = rng.standard_normal((levels.node_count, 4))
-    for transfer in (levels.prolongate, levels.restrict):
-        expected, x = nodal(values, device), nodal(values, device)
-        transfer(expected, 2)
-        with wp.ScopedCapture(device=device) as capture:
-            transfer(x, 2)
-        x.assign(values.astype(np.float32))
-        wp.capture_launch(capture.graph)
-        assert np.array_equal(x.numpy(), expected.numpy())
 
 
 def test_general_meshes_have_no_levels(device):
@@ -264,14 +165,3 @@ def test_general_meshes_have_no_levels(device):
     body = wc.SoftBody(wc.TetMesh(box.points, box.tets), SOFT, device=device)
     with pytest.raises(wc.InputError, match="only a TetForest has levels; this mesh is a TetMesh"):
         body.discretization.levels()
-
-
-def test_levels_and_arrays_that_do_not_fit_are_refused(device):
-    levels = body_of("uniform", device, worlds=2).discretization.levels()
-    x = wp.zeros(2 * levels.node_count, dtype=wp.vec4, device=device)
-    for transfer in (levels.prolongate, levels.restrict):
-        for coarse, fine in ((-1, 3), (4, 3), (0, levels.depth + 1)):
-            with pytest.raises(wc.InputError, match="they must be in order, from 0 to 7"):
-                transfer(x, coarse, fine)
-        with pytest.raises(wc.InputError, match=f"it must have 2 \\* {levels.node_count}"):
-            transfer(x[:-1])

@@ -27,7 +27,6 @@ from warp_corot.errors import InputError
 from warp_corot.inputs.checks import check_float32
 from warp_corot.inputs.cpu_threads import Team, team_of
 from warp_corot.kernels.corotated.anisotropic import OrthotropicMaterial, vec9
-from warp_corot.kernels.elements.elements import ForestElements
 from warp_corot.materials.anisotropic import Directional
 from warp_corot.materials.isotropic import Material
 from warp_corot.mesh import TetForest
@@ -117,7 +116,7 @@ class Discretization(ABC):
             InputError: The mesh is a general one, which has no tree.
         """
         if self._levels is None or self._levels.version != self.sizes.version:
-            self._levels = Levels(self._tree_nodes(), cast("ForestElements", self.elements), self.sizes)
+            self._levels = Levels(self._tree_nodes(), self.sizes)
         return self._levels
 
     @abstractmethod

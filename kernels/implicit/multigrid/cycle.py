@@ -139,179 +139,93 @@ def row_of(level: LevelArrays, world: int, i: int, lane: int, z: wp.array[wp.vec
     return sum_over_lanes(part, level.lanes)
 
 
-#: Native code of transfers: the vectors of one world, and its flags of free nodes. Warp's own loops over vec4 arrays
-#: take two to three times as long on a CPU.
-_MOVES = (
+#: What is moved: the residual from the mesh to the finest level; the correction back; the finer level's residual to a
+#: coarser one; and the coarser level's correction to the finer one.
+TAKE_IN, HAND_OUT, RESTRICT, PROLONGATE = range(4)
+
+
+@wp.struct
+class Transfer:
+    """What moves between a level and another one, or the mesh."""
+
+    kind: int
+    threads: int  # of each world
+    count: int  # nodes of the other level, or of the mesh, in one world
+    alpha: float  # the factor of the smoother's first step from zero; zero: none is made
+    starts: wp.array[wp.int32]  # where the midpoints of each node begin
+    places: wp.array[wp.int32]  # these midpoints; or the mesh's node of each rank
+    ends: wp.array[wp.vec2i]  # by rank
+    given: wp.array[wp.vec4]  # the other level's vector; or the residual by node
+    z: wp.array[wp.vec4]
+    result: wp.array[wp.vec4]  # by node
+
+
+@wp.func_native(
     FOUR
+    + constants(TAKE_IN=TAKE_IN, HAND_OUT=HAND_OUT, RESTRICT=RESTRICT)
     + """
     const auto vectors = [&](const auto& all, int nodes) {
         return reinterpret_cast<four*>(all.data) + (long long)world * nodes;
     };
     const unsigned char* is_free = level.free.data + (long long)world * level.ranks;
     const four zero = {0.0f, 0.0f, 0.0f, 0.0f};
-    const int count = level.count;
-"""
-)
-
-
-@wp.func_native(
-    _MOVES
-    + """
-    const four* from = vectors(given, mesh_nodes);
-    four* to = vectors(level.r, count);
-    for (int i = thread; i < count; i += threads) {
-        const int node = nodes.data[i];
-        to[i] = node < mesh_nodes && is_free[i] ? from[node] : zero;
-    }
-"""
-)
-def take_nodes(
-    world: int,
-    thread: int,
-    threads: int,
-    level: LevelArrays,
-    mesh_nodes: int,
-    nodes: wp.array[wp.int32],
-    given: wp.array[wp.vec4],
-): ...
-
-
-@wp.func_native(
-    _MOVES
-    + """
-    const four *from = vectors(z, count), *held = vectors(given, mesh_nodes);
-    four* to = vectors(result, mesh_nodes);
-    for (int i = thread; i < count; i += threads) {
-        const int node = nodes.data[i];
-        if (node < mesh_nodes) to[node] = is_free[i] ? from[i] : held[node];
-    }
-"""
-)
-def hand_nodes(
-    world: int,
-    thread: int,
-    threads: int,
-    level: LevelArrays,
-    mesh_nodes: int,
-    nodes: wp.array[wp.int32],
-    given: wp.array[wp.vec4],
-    z: wp.array[wp.vec4],
-    result: wp.array[wp.vec4],
-): ...
-
-
-@wp.func_native(
-    _MOVES
-    + """
-    const four* from = vectors(residual, fine);
-    four* to = vectors(level.r, count);
-    for (int i = thread; i < count; i += threads) {
-        four total = zero;
-        if (is_free[i]) {
-            for (int p = starts.data[i]; p < starts.data[i + 1]; ++p) total = total + from[midpoints.data[p]];
-            total = total * 0.5f + from[i];
+    const int count = level.count, others = transfer.count, threads = transfer.threads;
+    const int *starts = transfer.starts.data, *places = transfer.places.data;
+    const auto* ends = transfer.ends.data;
+    const four* given = vectors(transfer.given, others);
+    four *r = vectors(level.r, count), *z = vectors(transfer.z, count), *result = vectors(transfer.result, others);
+    if (transfer.kind == TAKE_IN)
+        for (int i = thread; i < count; i += threads) r[i] = places[i] < others && is_free[i] ? given[places[i]] : zero;
+    else if (transfer.kind == HAND_OUT)
+        for (int i = thread; i < count; i += threads) {
+            if (places[i] < others) result[places[i]] = is_free[i] ? z[i] : given[places[i]];
         }
-        to[i] = total;
-    }
+    else if (transfer.kind == RESTRICT)
+        for (int i = thread; i < count; i += threads) {
+            four total = zero;
+            if (is_free[i]) {
+                for (int p = starts[i]; p < starts[i + 1]; ++p) total = total + given[places[p]];
+                total = total * 0.5f + given[i];
+            }
+            r[i] = total;
+        }
+    else
+        for (int i = thread; i < count; i += threads)
+            if (is_free[i]) z[i] = z[i] + (i < others ? given[i] : (given[ends[i][0]] + given[ends[i][1]]) * 0.5f);
 """
 )
-def restrict_nodes(
-    world: int,
-    thread: int,
-    threads: int,
-    level: LevelArrays,
-    fine: int,
-    starts: wp.array[wp.int32],
-    midpoints: wp.array[wp.int32],
-    residual: wp.array[wp.vec4],
-): ...
+def move_nodes(world: int, thread: int, level: LevelArrays, transfer: Transfer):
+    """Warp's own loops over vec4 arrays take two to three times as long on a CPU."""
+    ...
 
 
-@wp.func_native(
-    _MOVES
-    + """
-    const four* from = vectors(correction, coarse);
-    four* to = vectors(z, count);
-    for (int i = thread; i < count; i += threads)
-        if (is_free[i]) to[i] = to[i] + (i < coarse ? from[i] : (from[ends.data[i][0]] + from[ends.data[i][1]]) * 0.5f);
-"""
-)
-def prolongate_nodes(
-    world: int,
-    thread: int,
-    threads: int,
-    level: LevelArrays,
-    coarse: int,
-    ends: wp.array[wp.vec2i],
-    correction: wp.array[wp.vec4],
-    z: wp.array[wp.vec4],
-): ...
+@wp.kernel(enable_backward=False)
+def move(level: LevelArrays, transfer: Transfer):
+    """Move residuals with P^T, or from the mesh, zero at held nodes, and make the smoother's first step from zero; or
+    corrections with P at free nodes, or to the mesh, where held nodes have the identity.
+    """
+    world, thread = wp.tid()
+    move_nodes(world, thread, level, transfer)
+    if transfer.alpha != 0.0:
+        for i in range(thread, level.count, transfer.threads):
+            at = world * level.count + i
+            store_node(transfer.z, at, transfer.alpha * (level.inverses[at] * load_node(level.r, at)))
 
 
 @wp.func
-def make_first_step(world: int, thread: int, threads: int, alpha: float, level: LevelArrays, z: wp.array[wp.vec4]):
-    """The smoother's first step from zero, unless alpha is zero."""
-    if alpha != 0.0:
-        for i in range(thread, level.count, threads):
-            at = world * level.count + i
-            store_node(z, at, alpha * (level.inverses[at] * load_node(level.r, at)))
-
-
-@wp.kernel(enable_backward=False)
-def take_in(
-    # In
-    threads: int,
-    level: LevelArrays,
-    mesh_nodes: int,
-    alpha: float,
-    nodes: wp.array[wp.int32],
-    given: wp.array[wp.vec4],
-    # Out
-    z: wp.array[wp.vec4],
-):
-    """Sort the residual by rank, zero at held nodes, and make the first step from zero."""
-    world, thread = wp.tid()
-    take_nodes(world, thread, threads, level, mesh_nodes, nodes, given)
-    make_first_step(world, thread, threads, alpha, level, z)
-
-
-@wp.kernel(enable_backward=False)
-def hand_out(
-    # In
-    threads: int,
-    level: LevelArrays,
-    mesh_nodes: int,
-    nodes: wp.array[wp.int32],
-    given: wp.array[wp.vec4],
-    z: wp.array[wp.vec4],
-    # Out
-    result: wp.array[wp.vec4],
-):
-    """Sort the result by node; held nodes have the identity."""
-    world, thread = wp.tid()
-    hand_nodes(world, thread, threads, level, mesh_nodes, nodes, given, z, result)
-
-
-@wp.kernel(enable_backward=False)
-def smooth(
-    # In
-    level: LevelArrays,
+def make_step(
+    at: int,
+    product: wp.vec3,
     alpha: float,
     beta: float,
     from_zero: bool,
+    level: LevelArrays,
     z: wp.array[wp.vec4],
-    # In and out
     other: wp.array[wp.vec4],
 ):
-    """Make one step: ``other`` has the values before z, or zero if the flag says so, and receives the values after
-    it.
+    """Make one step from A z of a node: ``other`` has the values before z, or zero if the flag says so, and receives
+    the values after it.
     """
-    world, thread = wp.tid()
-    i, lane = thread / level.lanes, thread % level.lanes
-    at = world * level.count + i
-    product = row_of(level, world, i, lane, z)
-    if lane > 0:
-        return
     now = load_node(z, at)
     step = alpha * (level.inverses[at] * (load_node(level.r, at) - product))
     if beta != 0.0:
@@ -323,6 +237,17 @@ def smooth(
 
 
 @wp.kernel(enable_backward=False)
+def smooth(
+    level: LevelArrays, alpha: float, beta: float, from_zero: bool, z: wp.array[wp.vec4], other: wp.array[wp.vec4]
+):
+    world, thread = wp.tid()
+    i, lane = thread / level.lanes, thread % level.lanes
+    product = row_of(level, world, i, lane, z)
+    if lane == 0:
+        make_step(world * level.count + i, product, alpha, beta, from_zero, level, z, other)
+
+
+@wp.kernel(enable_backward=False)
 def find_residual(level: LevelArrays, z: wp.array[wp.vec4], residual: wp.array[wp.vec4]):
     """r - A z."""
     world, thread = wp.tid()
@@ -331,41 +256,6 @@ def find_residual(level: LevelArrays, z: wp.array[wp.vec4], residual: wp.array[w
     product = row_of(level, world, i, lane, z)
     if lane == 0:
         store_node(residual, at, load_node(level.r, at) - product)
-
-
-@wp.kernel(enable_backward=False)
-def restrict_residual(
-    # In
-    threads: int,
-    level: LevelArrays,
-    fine: int,
-    alpha: float,
-    starts: wp.array[wp.int32],
-    midpoints: wp.array[wp.int32],
-    residual: wp.array[wp.vec4],
-    # Out
-    z: wp.array[wp.vec4],
-):
-    """P^T of the finer level's residual, zero at held nodes, and the first step from zero."""
-    world, thread = wp.tid()
-    restrict_nodes(world, thread, threads, level, fine, starts, midpoints, residual)
-    make_first_step(world, thread, threads, alpha, level, z)
-
-
-@wp.kernel(enable_backward=False)
-def prolongate_correction(
-    # In
-    threads: int,
-    level: LevelArrays,
-    coarse: int,
-    ends: wp.array[wp.vec2i],
-    correction: wp.array[wp.vec4],
-    # In and out
-    z: wp.array[wp.vec4],
-):
-    """z += P of the coarser level's correction, at free nodes."""
-    world, thread = wp.tid()
-    prolongate_nodes(world, thread, threads, level, coarse, ends, correction, z)
 
 
 #: What a sweep over the rows does: z = (D + L)^-1 r, with r - L z in ``other``; a sweep forward or backward; and

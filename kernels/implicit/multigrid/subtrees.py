@@ -23,6 +23,7 @@ from warp_corot.kernels.elements.elements import (
 )
 from warp_corot.kernels.elements.forces import in_local_frame, own_gradient
 from warp_corot.kernels.elements.shapes import leaf_forces_of
+from warp_corot.kernels.elements.simd8 import law_kernel
 from warp_corot.kernels.math.matrices import identity3
 from warp_corot.kernels.modules import unique_kernel
 from warp_corot.kernels.subtrees.forces import mat10
@@ -30,9 +31,9 @@ from warp_corot.kernels.subtrees.memory import memory_of
 from warp_corot.kernels.tables.shapes import VOLUME, fingerprint
 from warp_corot.kernels.tables.subtree import HANDEDNESS, LEAVES, POSITIONS
 
-from .cycle import LevelArrays
+from .cycle import LevelArrays, make_step
 from .pattern import EntrySums, kept_share, key_of
-from .values import inverse_block, semidefinite
+from .values import both_free, finish_entry, inverse_block, other_block
 
 wp.set_module_options({"enable_backward": False})
 
@@ -54,115 +55,85 @@ def rank_places(
 
 
 @wp.struct
-class OwnBlocks:
-    """What nodes add to the diagonal besides subtrees, by rank: a M, minus one at held nodes, and the blocks of other
-    forces, one if there are none.
-    """
+class SubtreeArrays:
+    """The finest level without its matrix, and what nodes add to the diagonal besides subtrees."""
 
-    masses: wp.array[float]
-    blocks: wp.array[wp.mat33]
+    level: LevelArrays
+    stiffening: float  # viscous damping counts as so many times b K
+    scales: wp.array[float]  # of the operator
+    masses: wp.array[float]  # a M, by rank; minus one at held nodes
+    blocks: wp.array[wp.mat33]  # of other forces, by rank; one if there are none
+    products: wp.array[wp.vec4]  # K z, zero between the steps
 
 
 @wp.kernel(enable_backward=False)
 def find_own(
     # In
-    ranks: int,
     mesh_nodes: int,
     nodes: wp.array[wp.int32],
-    free: wp.array[wp.uint8],
     inverse_mass: wp.array[float],
-    scales: wp.array[float],
     others: wp.array[wp.mat33],
     # Out
-    own: OwnBlocks,
+    arrays: SubtreeArrays,
+    marks: wp.array[wp.vec4],
 ):
-    """Find these from blocks by node."""
+    """Find these from blocks by node, and mark free nodes with one."""
     world, i = wp.tid()
-    at = world * ranks + i
+    at = world * arrays.level.ranks + i
     node = nodes[i]
-    own.masses[at] = 0.0
-    if free[at] == wp.uint8(0):
-        own.masses[at] = -1.0
-    elif node < mesh_nodes:
-        own.masses[at] = scales[0] / inverse_mass[world * mesh_nodes + node]
+    is_free = arrays.level.free[at] != wp.uint8(0)
+    has_node = node < mesh_nodes
+    mass = float(-1.0)
+    block = wp.mat33()
+    if is_free:
+        mass = 0.0
+        if has_node:
+            mass = arrays.scales[0] / inverse_mass[world * mesh_nodes + node]
+            block = other_block(others, world * mesh_nodes + node, arrays.scales)
+    arrays.masses[at] = mass
     if others.shape[0] > 1:
-        block = wp.mat33()
-        if node < mesh_nodes and free[at] != wp.uint8(0):
-            block = others[world * mesh_nodes + node]
-            if wp.trace(block) != 0.0:
-                block = scales[2] * semidefinite(block)
-        own.blocks[at] = block
+        arrays.blocks[at] = block
+    marks[at] = wp.vec4(wp.where(is_free, 1.0, 0.0), 0.0, 0.0, 0.0)
 
 
 @wp.func
-def own_block(own: OwnBlocks, at: int):
+def own_block(arrays: SubtreeArrays, at: int):
     """The block of a node; zero if the node is held."""
-    block = wp.max(own.masses[at], 0.0) * identity3()
-    if own.blocks.shape[0] > 1:
-        block += own.blocks[at]
+    block = wp.max(arrays.masses[at], 0.0) * identity3()
+    if arrays.blocks.shape[0] > 1:
+        block += arrays.blocks[at]
     return block
 
 
 @wp.func
-def finished_product(
-    at: int, stiffening: float, scales: wp.array[float], own: OwnBlocks, z: wp.vec3, products: wp.array[wp.vec4]
-):
+def finished_product(at: int, arrays: SubtreeArrays, z: wp.vec3):
     """A z of one node from K z, which becomes zero for the next product."""
-    product = (scales[2] + scales[1] * stiffening) * load_node(products, at) + own.masses[at] * z
-    if own.blocks.shape[0] > 1:
-        product += own.blocks[at] * z
-    store_node(products, at, wp.vec3())
+    scale = arrays.scales[2] + arrays.scales[1] * arrays.stiffening
+    product = scale * load_node(arrays.products, at) + arrays.masses[at] * z
+    if arrays.blocks.shape[0] > 1:
+        product += arrays.blocks[at] * z
+    store_node(arrays.products, at, wp.vec3())
     return product
 
 
 @wp.kernel(enable_backward=False)
 def finish_smoothing(
-    # In
-    alpha: float,
-    beta: float,
-    from_zero: bool,
-    stiffening: float,
-    scales: wp.array[float],
-    own: OwnBlocks,
-    inverses: wp.array[wp.mat33],
-    r: wp.array[wp.vec4],
-    z: wp.array[wp.vec4],
-    # In and out
-    products: wp.array[wp.vec4],
-    other: wp.array[wp.vec4],
+    arrays: SubtreeArrays, alpha: float, beta: float, from_zero: bool, z: wp.array[wp.vec4], other: wp.array[wp.vec4]
 ):
     """Make one step as ``cycle.smooth`` does, from ``products`` with K z."""
     at = wp.tid()
-    now = load_node(z, at)
-    product = finished_product(at, stiffening, scales, own, now, products)
-    step = alpha * (inverses[at] * (load_node(r, at) - product))
-    if beta != 0.0:
-        before = wp.vec3()
-        if not from_zero:
-            before = load_node(other, at)
-        step += beta * (now - before)
-    store_node(other, at, now + step)
+    product = finished_product(at, arrays, load_node(z, at))
+    make_step(at, product, alpha, beta, from_zero, arrays.level, z, other)
 
 
 @wp.kernel(enable_backward=False)
-def finish_residual(
-    # In
-    stiffening: float,
-    scales: wp.array[float],
-    own: OwnBlocks,
-    r: wp.array[wp.vec4],
-    z: wp.array[wp.vec4],
-    # In and out
-    products: wp.array[wp.vec4],
-    # Out
-    residual: wp.array[wp.vec4],
-):
+def finish_residual(arrays: SubtreeArrays, z: wp.array[wp.vec4], residual: wp.array[wp.vec4]):
     """r - A z, zero at held nodes, from ``products`` with K z."""
     at = wp.tid()
-    product = finished_product(at, stiffening, scales, own, load_node(z, at), products)
+    product = finished_product(at, arrays, load_node(z, at))
     rest = wp.vec3()
-    if own.masses[at] >= 0.0:
-        rest = load_node(r, at) - product
+    if arrays.masses[at] >= 0.0:
+        rest = load_node(arrays.level.r, at) - product
     store_node(residual, at, rest)
 
 
@@ -174,7 +145,7 @@ def keep_rows(shape: int, of: Dilatation) -> wp.Kernel:
     leaves = LEAVES[shape]
     measure, curvature_of = of.measure, of.curvature
 
-    @unique_kernel()
+    @law_kernel()
     def keep_rows(
         # In
         count: int,
@@ -283,28 +254,21 @@ def add_diagonals(shape: int, grouped: bool, uniform: bool, shares: bool) -> wp.
 
 
 @wp.kernel(enable_backward=False)
-def invert_diagonals(
-    # In
-    stiffening: float,
-    scales: wp.array[float],
-    own: OwnBlocks,
-    # In and out
-    straight: wp.array[wp.vec4],
-    mixed: wp.array[wp.vec4],
-    # Out
-    inverses: wp.array[wp.mat33],
-):
-    """Find the inverses of diagonal blocks, zero at held nodes, and empty their parts for the next time."""
+def invert_diagonals(arrays: SubtreeArrays, mixed: wp.array[wp.vec4]):
+    """Find the inverses of diagonal blocks, zero at held nodes, from their parts in ``products`` and ``mixed``, and
+    empty these for the next time."""
     at = wp.tid()
-    a = straight[at]
+    a = arrays.products[at]
     b = mixed[at]
-    straight[at] = wp.vec4()
+    arrays.products[at] = wp.vec4()
     mixed[at] = wp.vec4()
     inverse = wp.mat33()
-    if own.masses[at] >= 0.0:
+    if arrays.masses[at] >= 0.0:
         block = wp.mat33(a[0], b[0], b[1], b[0], a[1], b[2], b[1], b[2], a[2])
-        inverse = inverse_block((scales[2] + scales[1] * stiffening) * block + own_block(own, at))
-    inverses[at] = inverse
+        inverse = inverse_block(
+            (arrays.scales[2] + arrays.scales[1] * arrays.stiffening) * block + own_block(arrays, at)
+        )
+    arrays.level.inverses[at] = inverse
 
 
 #: The pairs of a root's corners, and the place of each.
@@ -434,14 +398,6 @@ def write_roots(shape: int, grouped: bool, uniform: bool, shares: bool) -> wp.Ke
 
 
 @wp.kernel(enable_backward=False)
-def mark_free(free: wp.array[wp.uint8], marks: wp.array[wp.vec4]):
-    """One at free nodes, else zero."""
-    at = wp.tid()
-    value = wp.where(free[at] != wp.uint8(0), 1.0, 0.0)
-    marks[at] = wp.vec4(value, 0.0, 0.0, 0.0)
-
-
-@wp.kernel(enable_backward=False)
 def list_root_pairs(
     # In
     first_root: int,
@@ -504,9 +460,7 @@ def gather_roots(
     level: LevelArrays,
     sums: EntrySums,
     roots: int,
-    stiffening: float,
-    scales: wp.array[float],
-    own: OwnBlocks,
+    arrays: SubtreeArrays,
     midpoint_starts: wp.array[wp.int32],
     midpoints: wp.array[wp.int32],
     middles: wp.array[wp.int32],
@@ -519,29 +473,21 @@ def gather_roots(
     """
     world, u = wp.tid()
     i = sums.upper[u][0]
-    j = sums.upper[u][1]
     first = world * level.ranks
     total = wp.mat33()
-    if level.free[first + i] != wp.uint8(0) and level.free[first + j] != wp.uint8(0):
+    if both_free(world, u, level, sums):
         for at in range(sums.starts[u], sums.starts[u + 1]):
             code = sums.codes[at]
             if code >= 0:
                 block = root_blocks[wp.static(ROOT_BLOCKS) * (world * roots + code / 32) + (code & 31) / 2]
-                if (code & 1) != 0:
+                if (code & 1) == 0:
                     block = wp.transpose(block)
                 total += block
-        total = (scales[2] + scales[1] * stiffening) * total
-        if i == j:
-            total += own_block(own, first + i)
+        total = (arrays.scales[2] + arrays.scales[1] * arrays.stiffening) * total
+        if i == sums.upper[u][1]:
+            total += own_block(arrays, first + i)
             for k in range(midpoint_starts[i], midpoint_starts[i + 1]):
-                total += 0.25 * own_block(own, first + midpoints[k])
+                total += 0.25 * own_block(arrays, first + midpoints[k])
         elif middles[u] >= 0:
-            total += 0.25 * own_block(own, first + middles[u])
-    where = sums.places[u]
-    at = world * level.entries
-    if i == j:
-        total = 0.5 * (total + wp.transpose(total))
-        inverses[world * level.count + i] = inverse_block(total)
-    else:
-        level.rows.blocks[at + where[1]] = total
-    level.rows.blocks[at + where[0]] = wp.transpose(total)
+            total += 0.25 * own_block(arrays, first + middles[u])
+    finish_entry(total, world, u, level, sums, inverses)

@@ -89,8 +89,8 @@ def write_frames(is_turned: bool) -> wp.Kernel:
 
 @wp.struct
 class Leaves:
-    """What the entries of the finest matrix come from. ``gradients`` come from ``tables.shapes``, [shape, node]; pairs
-    and rows come from ``pattern``."""
+    """What the finest matrix comes from, and its entries. ``gradients`` come from ``tables.shapes``, [shape, node];
+    pairs and rows come from ``pattern``."""
 
     elements: ForestElements
     world_elements: int
@@ -102,9 +102,19 @@ class Leaves:
     sums: EntrySums
     entries: int
     ranks: int
+    mesh_nodes: int
     row_entries: int
     pairs: wp.array[wp.vec2i]
     rows: wp.array[wp.vec4]
+    scales: wp.array[float]  # of the operator
+    stiffening: float  # viscous damping counts as so many times b K
+    most_lambda: float  # lambda counts as so many times mu at most
+    nodes: wp.array[wp.int32]  # by rank
+    inverse_mass: wp.array[float]  # by node
+    free: wp.array[wp.uint8]
+    others: wp.array[wp.mat33]  # blocks of other forces, by node; one if there are none
+    more: wp.array[wp.mat33]  # what the rows' weights add to the diagonal, by rank; one if there are none
+    blocks: wp.array[wp.mat33]
 
 
 @wp.func_native(
@@ -115,7 +125,8 @@ class Leaves:
     const auto &starts = leaves.sums.starts, &codes = leaves.sums.codes;
     const auto &mu = leaves.mu, &lam = leaves.lam;
     const int stride = leaves.stride;
-    const float scale = scales.data[2] + scales.data[1] * stiffening;
+    const auto &more = leaves.more, &blocks = leaves.blocks;
+    const float scale = leaves.scales.data[2] + leaves.scales.data[1] * leaves.stiffening;
     const long long first = (long long)world * leaves.world_elements, first_row = (long long)world * leaves.row_entries;
     const auto row = [&](int place) { return *reinterpret_cast<const four*>(&leaves.rows.data[first_row + place]); };
     const auto turned = [](const float* q, const float* g) {
@@ -149,7 +160,7 @@ class Leaves:
             const float* g = &leaves.gradients.data[4 * ((leaves.elements.code.data[t] & LEVELS) % 3)][0];
             const float* q = &leaves.frames.data[t].data[0][0];
             const four a = turned(q, g + 3 * ((code >> 2) & 3)), b = turned(q, g + 3 * (code & 3));
-            const float m = mu.data[t * stride], l = lam.data[t * stride], most = most_lambda * m;
+            const float m = mu.data[t * stride], l = lam.data[t * stride], most = leaves.most_lambda * m;
             const four la = a * (l < most ? l : most), mb = b * m, ab = a * mb;
             const float d = ab[0] + ab[1] + ab[2];
             c[0] += la * b[0] + mb * a[0] + four{d, 0.0f, 0.0f, 0.0f};
@@ -168,40 +179,18 @@ class Leaves:
     }
 """
 )
-def gather_entries(
-    number: int,
-    parts: int,
-    world: int,
-    leaves: Leaves,
-    scales: wp.array[float],
-    stiffening: float,
-    most_lambda: float,
-    blocks: wp.array[wp.mat33],
-    more: wp.array[wp.mat33],
-): ...
+def gather_entries(number: int, parts: int, world: int, leaves: Leaves): ...
 
 
 @unique_kernel()
-def gather_leaves(
-    # In
-    number: int,
-    parts: int,
-    leaves: Leaves,
-    scales: wp.array[float],
-    stiffening: float,
-    most_lambda: float,
-    # Out
-    blocks: wp.array[wp.mat33],
-    more: wp.array[wp.mat33],
-):
-    """Find the entries off the diagonal. Viscous damping counts as ``stiffening`` b K, and lambda as ``most_lambda`` mu
-    at most. ``more`` is the addition of the rows' weights to the diagonal, by rank, or one entry if there are none.
+def gather_leaves(number: int, parts: int, leaves: Leaves):
+    """Find the entries off the diagonal, and what weights add to it.
 
     A thread finds one of so many ``parts`` of the entries, from ``number`` on: one entry on CUDA. A column of a block
     is four lanes, so that a contribution takes some forty instructions on a CPU.
     """
     world, thread = wp.tid()
-    gather_entries(number + thread, parts, world, leaves, scales, stiffening, most_lambda, blocks, more)
+    gather_entries(number + thread, parts, world, leaves)
 
 
 @wp.func
@@ -227,22 +216,25 @@ def semidefinite(a: wp.mat33):
     return q * wp.diag(kept) * wp.transpose(q)
 
 
+@wp.func
+def other_block(others: wp.array[wp.mat33], node: int, scales: wp.array[float]):
+    """What other forces add to the diagonal of A at a node."""
+    block = wp.mat33()
+    if others.shape[0] > 1:
+        block = others[node]
+        if wp.trace(block) != 0.0:
+            block = scales[2] * semidefinite(block)
+    return block
+
+
 @wp.kernel(enable_backward=False)
 def finish_leaves(
     # In
     begin: int,
-    ranks: int,
-    mesh_nodes: int,
-    entries: int,
-    nodes: wp.array[wp.int32],
-    inverse_mass: wp.array[float],
-    scales: wp.array[float],
-    free: wp.array[wp.uint8],
+    leaves: Leaves,
     starts: wp.array[wp.int32],
     columns: wp.array[wp.int32],
     diagonal: wp.array[wp.int32],
-    others: wp.array[wp.mat33],
-    more: wp.array[wp.mat33],
     # In and out
     blocks: wp.array[wp.mat33],
     # Out
@@ -254,33 +246,51 @@ def finish_leaves(
     """
     world, i = wp.tid()
     i += begin
-    first = world * entries
+    first = world * leaves.entries
+    first_free = world * leaves.ranks
     own = diagonal[i]
-    is_free = free[world * ranks + i] != wp.uint8(0)
+    is_free = leaves.free[first_free + i] != wp.uint8(0)
     total = wp.mat33()
     for p in range(starts[i], starts[i + 1]):
         if p != own:
             total -= blocks[first + p]
-            if not is_free or free[world * ranks + columns[p]] == wp.uint8(0):
+            if not is_free or leaves.free[first_free + columns[p]] == wp.uint8(0):
                 blocks[first + p] = wp.mat33()
     inverse = wp.mat33()
     if is_free:
-        node = nodes[i]
-        if node < mesh_nodes:
-            mass = scales[0] / inverse_mass[world * mesh_nodes + node]
-            total += mass * wp.identity(n=3, dtype=float)
-            if others.shape[0] > 1:
-                block = others[world * mesh_nodes + node]
-                if wp.trace(block) != 0.0:
-                    total += scales[2] * semidefinite(block)
+        node = leaves.nodes[i]
+        if node < leaves.mesh_nodes:
+            node += world * leaves.mesh_nodes
+            mass = leaves.scales[0] / leaves.inverse_mass[node]
+            total += mass * wp.identity(n=3, dtype=float) + other_block(leaves.others, node, leaves.scales)
         smoothed = total
-        if more.shape[0] > 1:
-            smoothed += more[world * ranks + i]
+        if leaves.more.shape[0] > 1:
+            smoothed += leaves.more[first_free + i]
         inverse = inverse_block(smoothed)
     else:
         total = wp.mat33()
     blocks[first + own] = total
-    inverses[world * ranks + i] = inverse
+    inverses[first_free + i] = inverse
+
+
+@wp.func
+def finish_entry(
+    total: wp.mat33, world: int, u: int, level: LevelArrays, sums: EntrySums, inverses: wp.array[wp.mat33]
+):
+    """Write an entry of a coarser matrix, transposed, and its mirror image, or the inverse of a diagonal block."""
+    i, where, first = sums.upper[u][0], sums.places[u], world * level.entries
+    if i == sums.upper[u][1]:
+        total = 0.5 * (total + wp.transpose(total))
+        inverses[world * level.count + i] = inverse_block(total)
+    else:
+        level.rows.blocks[first + where[1]] = wp.transpose(total)
+    level.rows.blocks[first + where[0]] = total
+
+
+@wp.func
+def both_free(world: int, u: int, level: LevelArrays, sums: EntrySums):
+    i, j = world * level.ranks + sums.upper[u][0], world * level.ranks + sums.upper[u][1]
+    return level.free[i] != wp.uint8(0) and level.free[j] != wp.uint8(0)
 
 
 @wp.func
@@ -308,22 +318,12 @@ def gather_products(
     """
     world, thread = wp.tid()
     u, lane = thread // lanes, thread % lanes
-    i = sums.upper[u][0]
-    j = sums.upper[u][1]
     total = wp.mat33()
-    if level.free[world * level.ranks + i] != wp.uint8(0) and level.free[world * level.ranks + j] != wp.uint8(0):
+    if both_free(world, u, level, sums):
         weights = wp.vec3(1.0, 0.5, 0.25)
         for at in range(sums.starts[u] + lane, sums.starts[u + 1], lanes):
             code = sums.codes[at]
             total += weights[code & 3] * fine.rows.blocks[world * fine.entries + (code >> 2)]
     total = matrix_over_lanes(total, lanes)
-    if lane > 0:
-        return
-    where = sums.places[u]
-    first = world * level.entries
-    if i == j:
-        total = 0.5 * (total + wp.transpose(total))
-        inverses[world * level.count + i] = inverse_block(total)
-    else:
-        level.rows.blocks[first + where[1]] = wp.transpose(total)
-    level.rows.blocks[first + where[0]] = total
+    if lane == 0:
+        finish_entry(total, world, u, level, sums, inverses)

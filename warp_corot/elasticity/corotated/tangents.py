@@ -181,7 +181,7 @@ class SubtreeTangent(Tangent):
     def __init__(self, field: CorotatedField, batches: Sequence[Batch]):
         super().__init__(field)
         self._rotated, self._batches = RotatedTangent(field), tuple(batches)
-        self._places = [self._with_own_targets(batch) for batch in batches]
+        self._places = [with_own_targets(batch, field.device) for batch in batches]
         self._turns = [wp.zeros(8 * batch.count, dtype=wp.vec4, device=field.device) for batch in batches]
         self._keep = kernels.keep_turns(kernels.turned_by(field.model.own_rotation))
         uniform = field.isotropic.stride == 0
@@ -214,16 +214,17 @@ class SubtreeTangent(Tangent):
         self._rotated.take(self.displacements)
         self._rotated.add_diagonal(blocks)
 
-    def _with_own_targets(self, batch: Batch) -> Subtrees:
-        """The subtrees with their nodes as targets, for kernels with one thread a subtree."""
-        given, found = batch.subtrees, Subtrees()
-        found.code, found.first, found.frames, found.size = given.code, given.first, given.frames, given.size
-        found.nodes = given.nodes
-        if self.field.device.is_cpu:
-            places = np.ascontiguousarray(given.nodes.numpy()[: batch.count].T)
-            found.nodes = wp.array(places, dtype=wp.int32, device=self.field.device)
-        found.targets = found.nodes
-        return found
+
+def with_own_targets(batch: Batch, device: wp.Device) -> Subtrees:
+    """Subtrees with their nodes as targets, for kernels with one thread a subtree."""
+    given, found = batch.subtrees, Subtrees()
+    found.code, found.first, found.frames, found.size = given.code, given.first, given.frames, given.size
+    found.nodes = given.nodes
+    if device.is_cpu:
+        places = np.ascontiguousarray(given.nodes.numpy()[: batch.count].T)
+        found.nodes = wp.array(places, dtype=wp.int32, device=device)
+    found.targets = found.nodes
+    return found
 
 
 def subtrees_of(plan: Plan) -> tuple[Batch, ...] | None:

@@ -165,15 +165,18 @@ class AssembledSolve:
         self._bodies = [self._body_matrix(operator, self.threads) for operator in self._operators]
         self._find_rows(self.threads)
         # One more, since products read past the last.
-        self.diagonal, self._inverses, self._pivots = (
-            wp.zeros(nodes + 1, dtype=wp.mat33, device=device) for _ in range(3)
-        )
+        self.diagonal, self._inverses, pivots = (wp.zeros(nodes + 1, dtype=wp.mat33, device=device) for _ in range(3))
         self._rows.blocks = wp.zeros(self._worlds * self._entries + 1, dtype=wp.mat33, device=device)
         planes = 9 * self._worlds * self._entries if device.is_cuda else 1
         self._planes = wp.zeros(planes, dtype=wp.float32, device=device)
-        self._vectors = [wp.zeros(nodes, dtype=wp.vec4, device=device) for _ in range(5)]
+        data = self._data = kernels.Solve()
+        data.worlds, data.count, data.entries, data.rows = self._worlds, self._count, self._entries, self._rows
+        data.planes, data.inverses, data.pivots = self._planes, self._inverses, pivots
+        data.u, data.p, data.q, data.s, data.added = (wp.zeros(nodes, dtype=wp.vec4, device=device) for _ in range(5))
+        data.diagonal, data.division, data.team = self._diagonal, self._division, self._regions.team.address
         self._make_couplings(nodes)
-        self._find_launch(self._count, self._worlds)
+        data.couplings, data.of_contacts = self.couplings, self._of_contacts
+        self._find_launch(data)
 
     def _body_matrix(self, operator: TangentOperator, parts: int) -> _BodyMatrix:
         count, device, discretization = operator.node_count, self.device, operator.body.discretization
@@ -248,25 +251,27 @@ class AssembledSolve:
         entries.beside = wp.zeros(room, dtype=wp.int32, device=self.device)
         self._of_contacts, self._marks = entries, wp.zeros(nodes, dtype=wp.int32, device=self.device)
 
-    def _find_launch(self, count: int, worlds: int) -> None:
+    def _find_launch(self, data: kernels.Solve) -> None:
         """Find how blocks share the worlds, and threads the rows."""
+        count, worlds, teams = self._count, self._worlds, 1
         if self.device.is_cpu:
-            self._dim, self._per_team, self._lanes, self._block, teams = 1, self._regions.team.parts, 1, 256, 1
+            self._dim, self._block = 1, 256
+            data.per_team, data.lanes = self._regions.team.parts, 1
         else:
             blocks = self.device.sm_count
             # A block with few nodes mostly waits for the others.
-            self._per_team = max(min(blocks // worlds, count * MOST_LANES // THREADS), 1)
-            teams = min(blocks // self._per_team, worlds)
-            own = -(-count // self._per_team)
+            data.per_team = max(min(blocks // worlds, count * MOST_LANES // THREADS), 1)
+            teams = min(blocks // data.per_team, worlds)
+            own = -(-count // data.per_team)
             # Long rows are shared by more lanes.
             long = self._entries > MOST_LANES * count
-            self._lanes, self._block = 2 * FEWEST_LANES if long else FEWEST_LANES, THREADS
-            while self._lanes < MOST_LANES and 2 * self._lanes * own <= THREADS:
-                self._lanes *= 2
-            self._dim = teams * self._per_team * THREADS
-        sums = kernels.LINE * max(worlds, self._per_team) if self.device.is_cpu else 3 * teams * self._per_team
-        self._parts = wp.zeros(sums, dtype=wp.float64, device=self.device)
-        self._barriers = wp.zeros(STRIDE * teams, dtype=wp.uint32, device=self.device)
+            lanes, self._block = 2 * FEWEST_LANES if long else FEWEST_LANES, THREADS
+            while lanes < MOST_LANES and 2 * lanes * own <= THREADS:
+                lanes *= 2
+            self._dim, data.lanes = teams * data.per_team * THREADS, lanes
+        sums = kernels.LINE * max(worlds, data.per_team) if self.device.is_cpu else 3 * teams * data.per_team
+        data.parts = wp.zeros(sums, dtype=wp.float64, device=self.device)
+        data.barriers = wp.zeros(STRIDE * teams, dtype=wp.uint32, device=self.device)
 
     @property
     def threads(self) -> int:
@@ -291,10 +296,9 @@ class AssembledSolve:
             wp.launch(values.find_free, dim, inputs, [body.free], device=self.device)
             blocks = self._rows.blocks[first : first + operator.worlds * body.pattern.entries + 1]
             body.leaves.gather(operator, blocks, self._inverses[at:], holds=True)
-        inputs = [self._count, self._entries, self._division.nodes, self._diagonal, self._rows.blocks]
-        self._launch(kernels.keep_diagonal, self._count, inputs, [self.diagonal])
+        self._launch(kernels.keep_diagonal, self._count, [self.diagonal])
         if self.device.is_cuda:
-            self._launch(kernels.lay_out, self._entries, [self._entries, self._rows.blocks], [self._planes])
+            self._launch(kernels.lay_out, self._entries, [])
         self._empty()
         self._finish(is_new=True)
 
@@ -305,20 +309,16 @@ class AssembledSolve:
         self._finish(is_new=False)
         if self.device.is_cpu:
             self._of_contacts.heads.fill_(-1)
-            inputs = [self._count, self.threads, self._division, self.couplings]
-            wp.launch(kernels.add_entries, 1, inputs, [self._of_contacts], device=self.device)
+            wp.launch(kernels.add_entries, 1, [self.threads, self._data], device=self.device)
 
     def iterate(self, solver: ConjugateGradients, x: wp.array) -> None:
         """Launch iterations from the residual of x that a solve has begun with, in the worlds that run."""
-        if self.device.is_cuda and self._per_team > 1:
-            self._barriers.zero_()
-        inputs = [self._worlds, self._count, self._entries, self._per_team, self._lanes, solver.most, self._rows]
-        inputs += [self._planes, self._diagonal, self._inverses, self._pivots, self.couplings]
-        inputs += [self._of_contacts]
-        outputs = [x, solver.r, solver.scalars, solver.status, solver.iterations]
-        outputs += [*self._vectors, self._parts, self._barriers, self._division]
-        outputs += [self._regions.team.address]
-        wp.launch(kernels.solve, self._dim, inputs, outputs, device=self.device, block_dim=self._block)
+        data = self._data
+        if self.device.is_cuda and data.per_team > 1:
+            data.barriers.zero_()
+        data.most, data.x, data.r, data.scalars = solver.most, x, solver.r, solver.scalars
+        data.status, data.iterations = solver.status, solver.iterations
+        wp.launch(kernels.solve, self._dim, [data], device=self.device, block_dim=self._block)
 
     # --- on the host -------------------------------------------------------------------------------------------------
 
@@ -346,11 +346,9 @@ class AssembledSolve:
             each.zero_()
 
     def _finish(self, *, is_new: bool) -> None:
-        inputs = [0, int(is_new), self._count, self._entries, self._division.nodes, self._diagonal]
-        inputs += [self.diagonal, self.couplings]
-        outputs = [self._marks, self._rows.blocks, self._pivots, self._inverses, self._planes]
-        self._regions.launch_from(kernels.finish_matrix, (self._worlds, self._count), inputs, outputs)
+        inputs = [0, int(is_new), self.diagonal, self._marks, self._data]
+        self._regions.launch_from(kernels.finish_matrix, (self._worlds, self._count), inputs, [])
 
-    def _launch(self, kernel: wp.Kernel, count: int, inputs: list[Any], outputs: list[Any]) -> None:
+    def _launch(self, kernel: wp.Kernel, count: int, others: list[Any]) -> None:
         """Launch a kernel with ``count`` threads for each world of the matrix."""
-        wp.launch(kernel, (self._worlds, count), inputs, outputs, device=self.device)
+        wp.launch(kernel, (self._worlds, count), [self._data, *others], device=self.device)

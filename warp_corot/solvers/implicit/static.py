@@ -410,24 +410,28 @@ class _Interpolation:
         number[: levels.mesh_nodes] = np.arange(levels.mesh_nodes)
         number[levels.others.numpy()] = np.arange(levels.mesh_nodes, levels.node_count)
         self._nodes = number[self.coarser.nodes]
+        nodes, ends = levels.nodes.numpy(), levels.ends.numpy()
+        parts = [slice(*levels.starts[level : level + 2]) for level in range(self._level + 1, levels.depth + 1)]
+        self._midpoints = [(nodes[part], ends[part].T) for part in parts]
 
-    def restrict(self, values: npt.NDArray[np.floating]) -> npt.NDArray[np.float32]:
+    def restrict(self, values: npt.NDArray[np.floating]) -> npt.NDArray[np.float64]:
         """The transpose, from the mesh's nodes [worlds * N, 4] to the coarser one's [worlds, n, 4]."""
         levels = self._levels
-        everywhere = np.zeros((levels.worlds, levels.node_count, 4), np.float32)
-        everywhere[:, : levels.mesh_nodes] = values.reshape(levels.worlds, -1, 4)
-        x = wp.array(everywhere.reshape(-1, 4), dtype=wp.vec4, device=levels.device)
-        levels.restrict(x, self._level)
-        return x.numpy().reshape(everywhere.shape)[:, self._nodes]
+        found = np.zeros((levels.node_count, levels.worlds, 4))
+        found[: levels.mesh_nodes] = values.reshape(levels.worlds, -1, 4).swapaxes(0, 1)
+        for nodes, ends in reversed(self._midpoints):
+            for end in ends:
+                np.add.at(found, end, 0.5 * found[nodes])
+        return np.ascontiguousarray(found[self._nodes].swapaxes(0, 1))
 
-    def prolongate(self, values: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+    def prolongate(self, values: npt.NDArray[np.float32]) -> npt.NDArray[np.float64]:
         """From the coarser mesh's nodes [worlds * n, 4] to the mesh's [worlds * N, 4]."""
         levels = self._levels
-        everywhere = np.zeros((levels.worlds, levels.node_count, 4), np.float32)
-        everywhere[:, self._nodes] = values.reshape(levels.worlds, -1, 4)
-        x = wp.array(everywhere.reshape(-1, 4), dtype=wp.vec4, device=levels.device)
-        levels.prolongate(x, self._level)
-        return x.numpy().reshape(everywhere.shape)[:, : levels.mesh_nodes].reshape(-1, 4)
+        found = np.zeros((levels.node_count, levels.worlds, 4))
+        found[self._nodes] = values.reshape(levels.worlds, -1, 4).swapaxes(0, 1)
+        for nodes, ends in self._midpoints:
+            found[nodes] = 0.5 * (found[ends[0]] + found[ends[1]])
+        return found[: levels.mesh_nodes].swapaxes(0, 1).reshape(-1, 4)
 
 
 def _is_nested(body: SoftBody, law: Model) -> bool:

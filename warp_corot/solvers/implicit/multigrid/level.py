@@ -80,11 +80,11 @@ class SmoothedLevel:
             nodes: The node number of each rank, int32.
             given: The residual by number, vec4.
         """
-        self._move(cycle.take_in, [mesh_nodes, self._first_factor, nodes, given], self.z)
+        self._move(cycle.TAKE_IN, mesh_nodes, given, alpha=self._first_factor, places=nodes)
 
     def hand_out(self, mesh_nodes: int, nodes: wp.array, given: wp.array, result: wp.array) -> None:
         """Launch the finest level's correction by number; held nodes have what is given."""
-        self._move(cycle.hand_out, [mesh_nodes, nodes, given, self.z], result)
+        self._move(cycle.HAND_OUT, mesh_nodes, given, places=nodes, result=result)
 
     def smooth_before(self) -> None:
         """Smooth from zero; ``z`` already has the first step."""
@@ -112,22 +112,33 @@ class SmoothedLevel:
         if fine.factors:
             fine.find_residual()
         residual = fine.other if fine.factors else fine.r
-        inputs = [fine.count, self._first_factor, midpoints.starts, midpoints.midpoints, residual]
-        self._move(cycle.restrict_residual, inputs, self.z)
+        lists = {"starts": midpoints.starts, "places": midpoints.midpoints}
+        self._move(cycle.RESTRICT, fine.count, residual, alpha=self._first_factor, **lists)
 
     def take_correction(self, coarse: SmoothedLevel, ends: wp.array) -> None:
         """Add the correction of the coarser level to this one's."""
-        self._move(cycle.prolongate_correction, [coarse.count, ends, coarse.z], self.z)
+        self._move(cycle.PROLONGATE, coarse.count, coarse.z, ends=ends)
+
+    def coarser_pattern(self, finder: PatternFinder, count: int) -> Pattern:
+        """The pattern of the next level, of ``count`` nodes."""
+        raise NotImplementedError
+
+    def gather_into(self, coarse: Level, midpoints: Midpoints) -> None:
+        """Compute the coarser level's matrix P^T A P."""
+        raise NotImplementedError
 
     @property
     def _first_factor(self) -> float:
         """The factor of the smoother's first step from zero; zero: none is made."""
         return self.factors[0][0] if self.factors else 0.0
 
-    def _move(self, kernel: wp.Kernel, inputs: list[Any], output: wp.array) -> None:
-        """Launch a kernel whose threads share the nodes of each world; on a CPU there is one."""
-        threads = 1 if self.device.is_cpu else self.count
-        self.launch(kernel, threads, [threads, self.arrays, *inputs], [output])
+    def _move(self, kind: int, count: int, given: wp.array, **others: Any) -> None:
+        """Launch a transfer, whose threads share the nodes of each world; on a CPU there is one."""
+        transfer, threads = cycle.Transfer(), 1 if self.device.is_cpu else self.count
+        known = {"kind": kind, "threads": threads, "count": count, "given": given, "z": self.z}
+        for name, value in (known | others).items():
+            setattr(transfer, name, value)
+        self.launch(cycle.move, threads, [self.arrays, transfer], [])
 
     def launch(self, kernel: wp.Kernel, count: int, inputs: list[Any], outputs: list[Any]) -> None:
         """Launch a kernel with ``count`` threads for each world."""
@@ -180,10 +191,12 @@ class Level(SmoothedLevel):
         """Launch a kernel with the threads of each row."""
         self.launch(kernel, self.count * self.arrays.lanes, [self.arrays, *inputs], outputs)
 
-    def gather_from(self, fine: SmoothedLevel) -> None:
-        """Compute the matrix P^T A P from the finer level's matrix A."""
+    def coarser_pattern(self, finder: PatternFinder, count: int) -> Pattern:
+        return finder.of_products(self.pattern, count)
+
+    def gather_into(self, coarse: Level, midpoints: Midpoints) -> None:
         lanes = 1 if self.device.is_cpu else GATHERING_LANES
-        self.gather(values.gather_products, [lanes, self.arrays, self.pattern.sums, fine.arrays], lanes)
+        coarse.gather(values.gather_products, [lanes, coarse.arrays, coarse.pattern.sums, self.arrays], lanes)
 
     def gather(self, kernel: wp.Kernel, inputs: list[Any], lanes: int = 1) -> None:
         """Launch a kernel that computes blocks and inverses, with some threads for each entry of the upper triangle."""
@@ -333,7 +346,6 @@ class LeafMatrix:
         """
         body, members, found, count = self._discretization, self._members, self.pattern, len(self._nodes)
         sizes, elements, u, scales = body.sizes, self._elements, operator.displacements, operator.scales
-        others = operator.other_blocks()
         self._regions.launch_over(
             self._write_frames, sizes.elements, lambda _, own: ([own(elements), u], [own(self._frames)]), u.ptr
         )
@@ -341,32 +353,37 @@ class LeafMatrix:
             inputs: list[Any] = [sizes.world_elements, members.entries, members.arrays, elements, u]
             inputs += [body.mu, body.lam, body.material_stride, most_shared]
             self._launch(kernels.write_rows(members.law), members.count, inputs, [self._rows], u.ptr, most_shared)
-        inputs = [self._leaves(), scales, stiffening, most_lambda if members is None else 0.0]
+        leaves = self._leaves(operator, blocks, stiffening, most_lambda)
         threads = 1 if self.device.is_cpu else len(found.sums.upper)
-        parts, outputs = threads * self._regions.team.parts, [blocks, self._more]
+        parts = threads * self._regions.team.parts
         self._regions.launch(
             (blocks.ptr, scales.ptr, stiffening, most_lambda),
             lambda part: launch(
-                values.gather_leaves, (sizes.worlds, threads), [part, parts, *inputs], outputs, device=self.device
+                values.gather_leaves, (sizes.worlds, threads), [part, parts, leaves], [], device=self.device
             ),
         )
         if holds and members is not None and members.law.is_held:
             inputs = [sizes.world_elements, count, found.entries, elements, u, body.lam, body.material_stride]
             inputs += [scales, self._rank, found.starts, found.columns]
             wp.launch(kernels.add_held_blocks(members.law), sizes.elements, inputs, [blocks], device=self.device)
-        inputs = [count, self._mesh_nodes, found.entries, self._nodes, operator.inverse_mass, scales, self._free]
-        inputs += [found.starts, found.columns, found.diagonal, others, self._more]
-        key = [blocks.ptr, others.ptr, scales.ptr, operator.inverse_mass.ptr]
+        inputs = [leaves, found.starts, found.columns, found.diagonal]
+        key = [blocks.ptr, leaves.others.ptr, scales.ptr, operator.inverse_mass.ptr]
         self._launch(values.finish_leaves, count, inputs, [blocks, inverses], *key)
 
-    def _leaves(self) -> values.Leaves:
+    def _leaves(
+        self, operator: LinearOperator, blocks: wp.array, stiffening: float, most_lambda: float
+    ) -> values.Leaves:
         body, found, leaves = self._discretization, self.pattern, values.Leaves()
         leaves.elements, leaves.world_elements = self._elements, body.sizes.world_elements
         leaves.frames, leaves.gradients = self._frames, self._gradients
         leaves.mu, leaves.lam, leaves.stride = body.mu, body.lam, body.material_stride
         leaves.sums, leaves.entries, leaves.ranks = found.sums, found.entries, len(self._nodes)
-        leaves.row_entries = 0 if self._members is None else self._members.entries
-        leaves.pairs, leaves.rows = self._pairs, self._rows
+        leaves.mesh_nodes, leaves.nodes, leaves.free = self._mesh_nodes, self._nodes, self._free
+        leaves.pairs, leaves.rows, leaves.more, leaves.blocks = self._pairs, self._rows, self._more, blocks
+        leaves.scales, leaves.stiffening, leaves.inverse_mass = operator.scales, stiffening, operator.inverse_mass
+        leaves.others, leaves.most_lambda = operator.other_blocks(), most_lambda
+        if self._members is not None:
+            leaves.row_entries, leaves.most_lambda = self._members.entries, 0.0
         return leaves
 
     def _launch(self, kernel: wp.Kernel, count: int, inputs: list[Any], outputs: list[Any], *key: Hashable) -> None:

@@ -14,14 +14,13 @@ from warp_corot.discretization.groups import Members
 from warp_corot.discretization.levels import Levels
 from warp_corot.discretization.plan import Batch
 from warp_corot.errors import InputError
-from warp_corot.kernels.elements.elements import ForestElements
 from warp_corot.kernels.implicit.multigrid import pattern, values
 from warp_corot.kernels.implicit.multigrid import springs as kernels
 from warp_corot.solvers.implicit.operator import LinearOperator, Springs
 
 from .level import DenseInverse, LeafMatrix, Level, SmoothedLevel, SweptLevel
 from .pattern import Midpoints, Pattern, PatternFinder
-from .subtrees import RootLevel, SubtreeLevel, suitable_batches
+from .subtrees import SubtreeLevel, suitable_batches
 
 
 class SpringsOnLevels:
@@ -179,7 +178,7 @@ class Multigrid:
         free_inputs = [self.count, self._mesh_nodes, self._nodes, inverse_mass]
         finest.launch(values.find_free, self.count, free_inputs, [self._free])
         if isinstance(finest, SubtreeLevel):
-            finest.update(operator, self._mesh_nodes, self._nodes, operator.other_blocks())
+            finest.update(operator, self._mesh_nodes, self._nodes)
         else:
             assert isinstance(finest, Level)
             self._leaves.gather(
@@ -193,7 +192,7 @@ class Multigrid:
 
     def _update_coarser(self) -> None:
         for transfer in self._transfers:
-            transfer.coarse.gather_from(transfer.fine)
+            transfer.fine.gather_into(transfer.coarse, transfer.midpoints)
         if self._coarsest is not None:
             self._coarsest.update()
         if self._springs is not None:
@@ -252,28 +251,20 @@ class Multigrid:
         batches = self._subtrees(members)
         counts = self._counts(levels, on_roots=batches is not None)
         self._degrees = self._find_degrees(counts, None if batches is None else levels.depth - 3)
-        self.levels: list[SmoothedLevel] = []
-        self._transfers = []
         if batches is None:
-            self.levels.append(self._leaf_level(finder, rank, members, counts))
+            # Sweeps need no bound on eigenvalues.
+            bounded = members is not None and not self.sweeps
+            given = [self.discretization, finder, self._nodes, rank, self._mesh_nodes, self._free, members]
+            self._leaves = LeafMatrix(*given, is_turned=self.is_turned, is_bounded=bounded)
+            fine: SmoothedLevel = self._level(self._leaves.pattern, counts)
         else:
-            self._add_subtree_levels(finder, rank, members, counts, batches)
-        for count in counts[len(self.levels) :]:
-            fine = self.levels[-1]
-            assert isinstance(fine, Level)
-            coarse = self._level(finder.of_products(fine.pattern, count), counts)
+            fine = SubtreeLevel(self, batches, rank, self._free, self._degrees[0], members)
+        self.levels, self._transfers = [fine], []
+        for count in counts[1:]:
+            coarse = self._level(fine.coarser_pattern(finder, count), counts)
             self._transfers.append(Transfer(fine, coarse, finder.midpoints(count, fine.count)))
-            self.levels.append(coarse)
-        coarsest = cast("Level", self.levels[-1])
-        self._coarsest = DenseInverse(coarsest) if counts[-1] <= MOST_DENSE else None
-
-    def _leaf_level(self, finder: PatternFinder, rank: wp.array, members: Members | None, counts: list[int]) -> Level:
-        """The finest level with a matrix, and what it is computed from."""
-        # Sweeps need no bound on eigenvalues.
-        bounded = members is not None and not self.sweeps
-        given = [self.discretization, finder, self._nodes, rank, self._mesh_nodes, self._free, members]
-        self._leaves = LeafMatrix(*given, is_turned=self.is_turned, is_bounded=bounded)
-        return self._level(self._leaves.pattern, counts)
+            self.levels.append(fine := coarse)
+        self._coarsest = DenseInverse(cast("Level", fine)) if counts[-1] <= MOST_DENSE else None
 
     def _subtrees(self, members: Members | None) -> tuple[Batch, ...] | None:
         """The subtrees of which the finest level consists, if it goes without its matrix."""
@@ -283,43 +274,6 @@ class Multigrid:
         if members is not None and members.count != sum(batch.count for batch in batches or ()):
             return None
         return batches
-
-    def _add_subtree_levels(
-        self,
-        finder: PatternFinder,
-        rank: wp.array,
-        members: Members | None,
-        counts: list[int],
-        batches: tuple[Batch, ...],
-    ) -> None:
-        """Add the level of leaves and that of the roots of subtrees."""
-        fine = SubtreeLevel(
-            self.discretization,
-            batches,
-            rank,
-            self._free,
-            self._degrees[0],
-            is_turned=self.is_turned,
-            stiffening=self.stiffening,
-            most_lambda=self.most_lambda,
-            members=members,
-            most_shared=self.most_shared,
-        )
-        elements = cast("ForestElements", self.discretization.elements)
-        pattern = finder.of_roots(counts[1], batches, fine.roots, elements.nodes, rank)
-        midpoints = finder.midpoints(counts[1], fine.count)
-        coarse = RootLevel(
-            pattern,
-            self.discretization.worlds,
-            self.count,
-            self._free,
-            self._degrees[1],
-            members is not None,
-            midpoints=midpoints,
-            middles=finder.middles(pattern, fine.count),
-        )
-        self._transfers.append(Transfer(fine, coarse, midpoints))
-        self.levels += [fine, coarse]
 
     def _level(self, found: Pattern, counts: list[int]) -> Level:
         """A level with its smoother; the coarsest one's is only used where it is not inverted."""
