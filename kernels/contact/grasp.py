@@ -1,12 +1,14 @@
-"""Nodes that a tool holds at fixed places in its frame, rigidly or by springs.
+"""Springs that pull points of bodies to places: nodes that a tool holds, and patches that a person holds on the page.
 
-In implicit steps both are springs to the tool's pose at the end of the step. The rigid one is stiffer than the body and
-has the force of the last step as a multiplier, so a node at rest has no offset.
+A row is one spring on the weighted mean of some points, each of which up to four nodes carry. In implicit steps its
+force is that at the end of a step, and the matrix has its stiffness. A rigid grasp has a spring that is stiffer than
+the body, with the force of the last step as a multiplier, so that what is at rest has no offset; in explicit steps it
+is a constraint.
 """
 
 import warp as wp
 
-from warp_corot.kernels.elements.elements import load_node, store_node
+from warp_corot.kernels.elements.elements import add_force, load_node, store_node
 from warp_corot.kernels.modules import INLINED
 from warp_corot.kernels.stepping.pace import Pace
 
@@ -15,6 +17,99 @@ from .motion import Dynamics, Motions, foreseen
 from .shapes import carried
 
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": INLINED})
+
+
+@wp.struct
+class Spring:
+    """The spring of a row, between a place and the mean of its points."""
+
+    first: int  # its first entry in ``Attachments.points``
+    count: int  # the number of these; 0 while it holds nothing
+    target: wp.vec3  # the displacement to which it pulls the mean [m]
+    stiffness: float  # [N/m]
+    damping: float  # [N s/m]
+    limit: float  # the largest force [N]
+
+
+@wp.struct
+class Attachments:
+    """Springs, [R], and the points that they hold."""
+
+    springs: wp.array[Spring]
+    points: wp.array[wp.int32]
+    shares: wp.array[wp.float32]  # the weight of each in its row
+    nodes: wp.array[wp.vec4i]  # of each point, with their weights
+    weights: wp.array[wp.vec4]
+    multiplier: wp.array[wp.vec3]  # [R] [N]
+    force: wp.array[wp.vec3]  # [R] on the body [N]
+    moved: wp.array[wp.vec3]  # [R] the displacement of the mean [m]
+    softened: wp.array[wp.float32]  # [R] the stiffness that gives the force, which is no larger than the limit [N/m]
+
+
+@wp.func
+def mean_of(row: int, values: wp.array[wp.vec4], of: Attachments):
+    """The mean of nodal vectors at the points of a row."""
+    mean = wp.vec3()
+    for entry in range(of.springs[row].first, of.springs[row].first + of.springs[row].count):
+        p = of.points[entry]
+        for m in range(4):
+            if of.weights[p][m] != 0.0:
+                mean += (of.shares[entry] * of.weights[p][m]) * load_node(values, of.nodes[p][m])
+    return mean
+
+
+@wp.func
+def add_to_points(row: int, force: wp.vec3, of: Attachments, y: wp.array[wp.vec4]):
+    """Add a force on the mean of a row to the nodes of its points."""
+    for entry in range(of.springs[row].first, of.springs[row].first + of.springs[row].count):
+        p = of.points[entry]
+        for m in range(4):
+            if of.weights[p][m] != 0.0:
+                add_force(y, of.nodes[p][m], (of.shares[entry] * of.weights[p][m]) * force)
+
+
+@wp.kernel(enable_backward=False)
+def pull(u: wp.array[wp.vec4], v: wp.array[wp.vec4], of: Attachments, f: wp.array[wp.vec4]):
+    """Add the springs' forces in a state with displacements u and velocities v to f."""
+    row = wp.tid()
+    spring = of.springs[row]
+    of.force[row] = wp.vec3()
+    if spring.count == 0:
+        return
+    moved = mean_of(row, u, of)
+    stretch = spring.target - moved
+    force = of.multiplier[row] + spring.stiffness * stretch
+    if spring.damping > 0.0:
+        force -= spring.damping * mean_of(row, v, of)
+    size = wp.length(force)
+    if size > spring.limit:
+        force *= spring.limit / size
+    of.force[row] = force
+    of.moved[row] = moved
+    of.softened[row] = wp.min(spring.stiffness, spring.limit / wp.max(wp.length(stretch), 1.0e-30))
+    add_to_points(row, force, of, f)
+
+
+@wp.kernel(enable_backward=False)
+def add_products(of: Attachments, p: wp.array[wp.vec4], y: wp.array[wp.vec4]):
+    """y += K p."""
+    row = wp.tid()
+    add_to_points(row, of.softened[row] * mean_of(row, p, of), of, y)
+
+
+@wp.kernel(enable_backward=False)
+def add_blocks(of: Attachments, blocks: wp.array[wp.mat33]):
+    """Add the blocks on K's diagonal, or a part of them where points of a row share nodes."""
+    row = wp.tid()
+    for entry in range(of.springs[row].first, of.springs[row].first + of.springs[row].count):
+        p = of.points[entry]
+        for m in range(4):
+            w = of.shares[entry] * of.weights[p][m]
+            if w != 0.0:
+                wp.atomic_add(blocks, of.nodes[p][m], (w * w * of.softened[row]) * wp.identity(n=3, dtype=float))
+
+
+# --- nodes that a tool holds at fixed places in its frame -------------------------------------------------------------
 
 #: Whether a node is held: not while the grasp is open, yes, or not because it was out of reach when the grasp closed.
 OPEN, HELD, MISSED = (wp.constant(k) for k in range(3))
@@ -99,7 +194,7 @@ def hold_in_tool(
 
 
 @wp.kernel(enable_backward=False)
-def pull_to_tool(
+def aim(
     # In
     nodes: wp.array[wp.int32],
     per_world: int,
@@ -107,41 +202,19 @@ def pull_to_tool(
     motions: Motions,
     places: wp.array[wp.vec3],
     held: wp.array[wp.int32],
-    stiffness: float,
-    multipliers: wp.array[wp.vec3],
+    is_rigid: int,
     inverse_mass: wp.array[wp.float32],
     rest: wp.array[wp.vec4],
-    u: wp.array[wp.vec4],
     # In and out
-    f: wp.array[wp.vec4],
-    # Out
-    forces: wp.array[wp.vec3],
+    of: Attachments,
 ):
-    """Add the springs' forces in the body's state, with the tool in its pose at the end of the step."""
+    """Let springs pull held nodes to where the tool will be at the end of an implicit step, from the last force."""
     k = wp.tid()
-    i = nodes[k]
-    force = wp.vec3()
-    if inverse_mass[i] > 0.0 and held[k] == HELD:
-        there = wp.transform_point(motions.later[k / per_world, o], places[k])
-        force = multipliers[k] + stiffness * (there - load_node(rest, i) - load_node(u, i))
-        store_node(f, i, load_node(f, i) + force)
-    forces[k] = force
-
-
-@wp.kernel(enable_backward=False)
-def add_hold_product(
-    nodes: wp.array[wp.int32], held: wp.array[wp.int32], stiffness: float, p: wp.array[wp.vec4], y: wp.array[wp.vec4]
-):
-    k = wp.tid()
-    if held[k] == HELD:
-        store_node(y, nodes[k], load_node(y, nodes[k]) + stiffness * load_node(p, nodes[k]))
-
-
-@wp.kernel(enable_backward=False)
-def add_hold_blocks(nodes: wp.array[wp.int32], held: wp.array[wp.int32], stiffness: float, blocks: wp.array[wp.mat33]):
-    k = wp.tid()
-    if held[k] == HELD:
-        blocks[nodes[k]] = blocks[nodes[k]] + stiffness * wp.identity(3, dtype=wp.float32)
+    spring = of.springs[k]
+    spring.count = wp.where(held[k] == HELD and inverse_mass[nodes[k]] > 0.0, 1, 0)
+    spring.target = wp.transform_point(motions.later[k / per_world, o], places[k]) - load_node(rest, nodes[k])
+    of.springs[k] = spring
+    of.multiplier[k] = wp.where(is_rigid != 0, of.force[k], wp.vec3())
 
 
 @wp.kernel(enable_backward=False)

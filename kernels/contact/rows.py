@@ -32,10 +32,7 @@ class Meeting:
     outs: wp.array[wp.vec3]  # [E] the sums of the two normals at each edge, at the last search
     reach: wp.array[wp.float32]  # [S] how far a node may move until the next search for pairs [m]
     ahead: wp.array[wp.vec3]  # see ``Watch``
-    lower: wp.array2d[wp.vec3]  # [worlds, bodies] bounds of the places that a body may reach [m]
-    upper: wp.array2d[wp.vec3]
-    groups: int  # groups of boxes in a world: one for each body, or one for all of them
-    roots: wp.array2d[wp.int32]  # [2, worlds * groups] the groups' roots in the trees of triangles and of edges
+    roots: wp.array3d[wp.int32]  # [2, worlds, bodies] the bodies' roots in the trees of triangles and of edges; CUDA
     meets_itself: int
     flat_edges: int  # whether flat edges may touch flat edges
     friction: float

@@ -1,9 +1,11 @@
-"""The search for nodes and triangles, and for edges, that may come near each other before the next search; see
-``search_by_warp`` for CUDA."""
+"""The search for nodes and triangles, and for edges, that may come near each other before the next search."""
+
+import functools
 
 import warp as wp
 
 from warp_corot.kernels.modules import INLINED, unique_kernel
+from warp_corot.kernels.stepping.threads import lanes_with, of_first_lane, sum_before, synchronize_warp
 
 from .bearing import share_bearers
 from .boxes import edge_reach, lower_end, triangle_reach, triangle_size, upper_end
@@ -16,9 +18,9 @@ from .wide_tree import BLUNT, MAY_FACE, NEARLY, WideTree, query_wide
 
 wp.set_module_options({"enable_backward": False})
 
-#: Number of neighbours that a thread keeps; with more, it finds them a second time.
-KEPT = wp.constant(32)
-Kept = wp.types.vector(length=32, dtype=wp.int32)
+#: Threads of a warp, and the number of neighbours that one keeps; if one has more, the warp finds all a second time.
+LANES, KEPT = wp.constant(32), wp.constant(8)
+Kept = wp.types.vector(length=8, dtype=wp.int32)
 
 #: Edges with a larger sine of the bend are sharp.
 SHARP = wp.constant(0.15)
@@ -229,118 +231,57 @@ def edge_is_near(k: int, m: int, is_sharp: bool, out: wp.vec3, surface: Surface,
     return other <= SHARP and m > k and flat_edges_cross(k, m, far, s, t, way, surface, meeting)
 
 
-@wp.func
-def add_other(start: int, count: int, other: int, rows: Rows):
-    """Insert one more entry after a start, in order."""
-    row = start + count
-    while row > start and rows.other[row - 1] > other:
-        rows.other[row] = rows.other[row - 1]
-        row -= 1
-    rows.other[row] = other
+@wp.struct
+class Owner:
+    """What looks for its neighbours: a node or an edge."""
+
+    place: int  # a node of it; -1: there is nothing to look for
+    is_edge: int
+    is_sharp: wp.bool
+    out: wp.vec3  # its normal, or the sum of both sides' ones
+    low: wp.vec3  # its box, with what it may move [m]
+    high: wp.vec3
+    reach: float  # how far it may move [m]
 
 
 @wp.func
-def in_order(kept: Kept, count: int):
-    """The first ones that are kept, in order."""
-    for k in range(1, count):
-        other = kept[k]
-        m = int(k)
-        while m > 0 and kept[m - 1] > other:
-            kept[m] = kept[m - 1]
-            m -= 1
-        kept[m] = other
-    return kept
-
-
-@wp.func
-def add_found(other: int, start: int, count: int, rows: Rows, kept: Kept):
-    """Keep one more neighbour, or write it if a start is given."""
-    if start >= 0:
-        add_other(start, count, other, rows)
-    elif count < KEPT:
-        kept[count] = other
-    return kept
-
-
-@wp.func
-def near_node(
-    i: int, start: int, tree: WideTree, surface: Surface, meeting: Meeting, near: Near, rows: Rows, kept: Kept
-):
-    """Count the triangles near a node and keep the first ones, or write all if a start is given."""
-    count = int(0)
-    reach = meeting.reach[i]
-    beyond = wp.vec3(reach, reach, reach)
-    low = lower_end(i, surface, meeting) - beyond
-    high = upper_end(i, surface, meeting) + beyond
-    out = node_normal(i, meeting)
-    is_own = meeting.meets_itself
-    far = wp.where(meeting.ahead.shape[0] > 0, -1.0, NEARLY * reach)
-    x = surface.x[i]
-    found = query_wide(tree, 0, surface.world[i], meeting.body[i], is_own, low, high, out, far, x, x)
-    for k in range(found):
-        t = tree.found[k]
-        if node_is_near(i, t, out, surface, meeting, near):
-            kept = add_found(t, start, count, rows, kept)
-            count += 1
-    return count, kept
-
-
-@wp.func
-def finds_pairs(bend: float, meeting: Meeting):
-    """Whether an edge with this bend looks for others: a sharp one, or a flat one if they touch."""
-    return bend > SHARP or (bend >= -SHARP and meeting.flat_edges != 0)
-
-
-@wp.func
-def near_edge(
-    k: int, start: int, tree: WideTree, surface: Surface, meeting: Meeting, near: Near, rows: Rows, kept: Kept
-):
-    """Count the edges near one that is sharp, or flat, and keep the first ones, or write all if a start is given."""
-    count = int(0)
-    own = bend(surface, meeting, k)
-    if not finds_pairs(own, meeting):
-        return 0, kept
-    e = meeting.edges[k]
-    reach = edge_reach(meeting, e)
-    beyond = wp.vec3(reach, reach, reach)
-    low = wp.min(lower_end(e[0], surface, meeting), lower_end(e[1], surface, meeting)) - beyond
-    high = wp.max(upper_end(e[0], surface, meeting), upper_end(e[1], surface, meeting)) + beyond
-    out = meeting.outs[k]
-    length = wp.length(out)
-    way = wp.where(length < BLUNT, wp.vec3(), out / length)
-    is_own = meeting.meets_itself
-    far = wp.where(meeting.ahead.shape[0] > 0, -1.0, NEARLY * reach)
-    x = surface.x[e[0]]
-    along = surface.x[e[1]] - x
-    found = query_wide(tree, 1, surface.world[e[0]], meeting.body[e[0]], is_own, low, high, way, far, x, along)
-    for n in range(found):
-        m = tree.found[n]
-        if edge_is_near(k, m, own > SHARP, out, surface, meeting, near):
-            kept = add_found(m, start, count, rows, kept)
-            count += 1
-    return count, kept
-
-
-@wp.func
-def near_owner(
-    i: int,
-    start: int,
-    tree: WideTree,
-    surface: Surface,
-    meeting: Meeting,
-    near: Near,
-    rows: Rows,
-    kept: Kept,
-):
+def owner_of(i: int, surface: Surface, meeting: Meeting):
+    """The node or the edge with a number; an edge looks for others if it is sharp, or flat if these touch."""
     nodes = meeting.body.shape[0]
-    count = int(0)
-    found = kept
+    found = Owner()
+    found.place = -1
     if i < nodes:
         if surface.node[i] >= 0:
-            count, found = near_node(i, start, tree, surface, meeting, near, rows, kept)
-    elif meeting.edges[i - nodes][0] >= 0:
-        count, found = near_edge(i - nodes, start, tree, surface, meeting, near, rows, kept)
-    return count, found
+            found.place = i
+            found.out = node_normal(i, meeting)
+            found.reach = meeting.reach[i]
+            found.low = lower_end(i, surface, meeting)
+            found.high = upper_end(i, surface, meeting)
+    else:
+        e = meeting.edges[i - nodes]
+        if e[0] >= 0:
+            own = bend(surface, meeting, i - nodes)
+            if own > SHARP or (own >= -SHARP and meeting.flat_edges != 0):
+                found.place = e[0]
+                found.is_edge = 1
+                found.is_sharp = own > SHARP
+                found.out = meeting.outs[i - nodes]
+                found.reach = edge_reach(meeting, e)
+                found.low = wp.min(lower_end(e[0], surface, meeting), lower_end(e[1], surface, meeting))
+                found.high = wp.max(upper_end(e[0], surface, meeting), upper_end(e[1], surface, meeting))
+    beyond = wp.vec3(found.reach, found.reach, found.reach)
+    found.low -= beyond
+    found.high += beyond
+    return found
+
+
+@wp.func
+def is_near(i: int, other: int, owner: Owner, surface: Surface, meeting: Meeting, near: Near):
+    """Whether an owner may touch a triangle or an edge before the next search."""
+    if owner.is_edge != 0:
+        k = i - meeting.body.shape[0]
+        return edge_is_near(k, other, owner.is_sharp, owner.out, surface, meeting, near)
+    return node_is_near(i, other, owner.out, surface, meeting, near)
 
 
 @wp.func
@@ -396,57 +337,165 @@ def distance_in(owner: int, other: int, surface: Surface, meeting: Meeting):
     return wp.max(wp.length(p + s * (q - p) - r - t * (u - r)) - band, 0.0)
 
 
-@unique_kernel(cpu_compiler_flags=INLINED)
-def find_pairs(
-    # In
-    watch: Watch,
-    tree: WideTree,
-    surface: Surface,
-    meeting: Meeting,
-    old: OldRows,
-    # Out
-    rows: Rows,
-    near: Near,
-):
-    """Find the pairs of each node and edge, with their former forces, on the CPU."""
-    i = wp.tid()
-    if watch.due[0] == 0:
-        return
-    room = rows.owner.shape[0]
-    count, kept = near_owner(i, -1, tree, surface, meeting, near, rows, Kept())
-    start = int(0)
-    rows.counts[i] = 0
-    if count > 0:
-        start = wp.atomic_add(rows.total, 0, count)
-    rows.starts[i] = start
-    if start + count > room:
-        # The host repeats the run with larger arrays.
-        for row in range(start, room):
-            rows.owner[row] = -1
-        return
-    if count == 0:
-        return
-    if count <= KEPT:
-        kept = in_order(kept, count)
-        for k in range(count):
-            rows.other[start + k] = kept[k]
-    else:
-        near_owner(i, start, tree, surface, meeting, near, rows, kept)
-    rows.counts[i] = count
-    before = old.starts[i]
-    last = before + old.counts[i]
-    for row in range(start, start + count):
-        other = rows.other[row]
-        while before < last and old.other[before] < other:
-            before += 1
-        acts = int(0)
-        force = wp.vec3()
-        if before < last and old.other[before] == other:
-            acts = old.acts[before]
-            force = old.force[before]
-        rows.owner[row] = i
-        rows.acts[row] = acts
-        rows.force[row] = force
-        rows.places[row] = places_in(i, other, meeting)
-        rows.away[row] = distance_in(i, other, surface, meeting)
-        mark_row(i, other, meeting, near)
+@functools.cache
+def pair_finder(is_wide: bool) -> wp.Kernel:
+    """The search for pairs, in a wide tree by one thread of the CPU for each owner, or in a tree of Warp's by a warp of
+    CUDA, whose threads go through the tree together and each test one of the next 32 candidates: few owners are near
+    anything, so that a thread for each would wait for memory most of the time."""
+    lanes = 1 if is_wide else LANES
+
+    @wp.func
+    def find_in_wide_tree(i: int, owner: Owner, tree: WideTree, surface: Surface, meeting: Meeting, near: Near):
+        """How many neighbours there are, which are then the first ones of ``tree.found``."""
+        way = wp.vec3()
+        out = owner.out
+        if owner.is_edge != 0:
+            way = surface.x[meeting.edges[i - meeting.body.shape[0]][1]] - surface.x[owner.place]
+            out = wp.where(wp.length(out) < BLUNT, wp.vec3(), wp.normalize(out))
+        reach = wp.where(meeting.ahead.shape[0] > 0, -1.0, NEARLY * owner.reach)
+        world = surface.world[owner.place]
+        found = query_wide(
+            tree, owner.is_edge, world, meeting.body[owner.place], meeting.meets_itself, owner.low, owner.high, out,
+            reach, surface.x[owner.place], way,
+        )  # fmt: skip
+        count = int(0)
+        for k in range(found):
+            other = tree.found[k]
+            if is_near(i, other, owner, surface, meeting, near):
+                tree.found[count] = other
+                count += 1
+        return count
+
+    @wp.func
+    def find_by_warp(
+        i: int, lane: int, start: int, owner: Owner, of_triangles: wp.uint64, of_edges: wp.uint64, surface: Surface,
+        meeting: Meeting, near: Near, rows: Rows, kept: Kept,
+    ):  # fmt: skip
+        """How many neighbours there are, and how many of them this thread has found, of which it keeps the first ones;
+        or, if a start is given, write all, in any order."""
+        count = int(0)
+        mine = int(0)
+        tree = of_triangles
+        if owner.is_edge != 0:
+            tree = of_edges
+        for body in range(meeting.roots.shape[2]):
+            if meeting.meets_itself != 0 or body != meeting.body[owner.place]:
+                root = meeting.roots[owner.is_edge, surface.world[owner.place], body]
+                query = wp.bvh_query_aabb(tree, owner.low, owner.high, root)
+                goes_on = bool(True)
+                while goes_on:
+                    held = int(-1)
+                    number = int(0)
+                    while goes_on and number < LANES:
+                        other = int(0)
+                        goes_on = wp.bvh_query_next(query, other)
+                        if goes_on:
+                            if number == lane:
+                                held = other
+                            number += 1
+                    found = int(0)
+                    if held >= 0:
+                        found = int(is_near(i, held, owner, surface, meeting, near))
+                    at = count + sum_before(found)
+                    if found != 0:
+                        if start >= 0:
+                            rows.acts[start + at] = held
+                        elif mine < KEPT:
+                            kept[mine] = held
+                        mine += 1
+                    count += lanes_with(found)
+        return count, mine, kept
+
+    @unique_kernel(cpu_compiler_flags=INLINED)
+    def find_pairs(
+        # In
+        watch: Watch,
+        tree: WideTree,
+        of_triangles: wp.uint64,
+        of_edges: wp.uint64,
+        surface: Surface,
+        meeting: Meeting,
+        old: OldRows,
+        # Out
+        rows: Rows,
+        near: Near,
+    ):
+        """Find the pairs of each node and edge, with their former forces."""
+        thread = wp.tid()
+        if watch.due[0] == 0:
+            return
+        i = thread // lanes
+        lane = thread % lanes
+        room = rows.owner.shape[0]
+        owner = owner_of(i, surface, meeting)
+        count = int(0)
+        mine = int(0)
+        kept = Kept()
+        if owner.place >= 0:
+            if wp.static(is_wide):
+                count = find_in_wide_tree(i, owner, tree, surface, meeting, near)
+            else:
+                count, mine, kept = find_by_warp(
+                    i, lane, -1, owner, of_triangles, of_edges, surface, meeting, near, rows, kept
+                )
+        start = int(0)
+        if lane == 0 and count > 0:
+            start = wp.atomic_add(rows.total, 0, count)
+        start = of_first_lane(start)
+        is_full = start + count > room
+        if lane == 0:
+            rows.starts[i] = start
+            rows.counts[i] = wp.where(is_full, 0, count)
+        if is_full:
+            # The host repeats the run with larger arrays.
+            row = start + lane
+            while row < room:
+                rows.owner[row] = -1
+                row += lanes
+            return
+        if count == 0:
+            return
+        # First in the order in which they were found, in the place of ``acts``, and then in that of their numbers.
+        if wp.static(is_wide):
+            for k in range(count):
+                rows.acts[start + k] = tree.found[k]
+        elif lanes_with(wp.where(mine > KEPT, 1, 0)) != 0:
+            find_by_warp(i, lane, start, owner, of_triangles, of_edges, surface, meeting, near, rows, kept)
+        else:
+            first = start + sum_before(mine)
+            for k in range(KEPT):
+                if k < mine:
+                    rows.acts[first + k] = kept[k]
+        synchronize_warp()
+        k = int(lane)
+        while k < count:
+            other = rows.acts[start + k]
+            rank = int(0)
+            for m in range(count):
+                if rows.acts[start + m] < other:
+                    rank += 1
+            rows.other[start + rank] = other
+            k += lanes
+        synchronize_warp()
+        before = old.starts[i]
+        last = before + old.counts[i]
+        row = start + lane
+        while row < start + count:
+            other = rows.other[row]
+            while before < last and old.other[before] < other:
+                before += 1
+            acts = int(0)
+            force = wp.vec3()
+            if before < last and old.other[before] == other:
+                acts = old.acts[before]
+                force = old.force[before]
+            rows.owner[row] = i
+            rows.acts[row] = acts
+            rows.force[row] = force
+            if wp.static(is_wide):
+                rows.places[row] = places_in(i, other, meeting)
+                rows.away[row] = distance_in(i, other, surface, meeting)
+            mark_row(i, other, meeting, near)
+            row += lanes
+
+    return find_pairs

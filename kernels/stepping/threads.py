@@ -167,30 +167,3 @@ def synchronize_warp():
 #endif
 """)
 def shuffle_down(value: wp.vec3, distance: int) -> wp.vec3: ...
-
-
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-    int same;
-    __match_all_sync(0xffffffffu, value, &same);
-    return same != 0;
-#else
-    return true;
-#endif
-""")
-def same_in_lanes(value: int) -> bool:
-    """Whether all threads of a warp, all of which must ask, have one value."""
-    ...
-
-
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-    for (int k = 16; k > 0; k >>= 1)
-        for (int axis = 0; axis < 3; ++axis)
-            value[axis] = fminf(value[axis], __shfl_xor_sync(0xffffffffu, value[axis], k));
-#endif
-    return value;
-""")
-def least_of_lanes(value: wp.vec3) -> wp.vec3:
-    """The least components among the threads of a warp, in each of them."""
-    ...

@@ -83,12 +83,10 @@ def watched(sim, steps, itself):
     return seen
 
 
-@pytest.mark.parametrize("own_trees", [16, 1], ids=["each its tree", "one tree"])
 @pytest.mark.parametrize("itself", [False, True])
-def test_the_search_finds_all_pairs_within_reach(device, rng, itself, own_trees, monkeypatch):
+def test_the_search_finds_all_pairs_within_reach(device, rng, itself, monkeypatch):
     """Compared with every pair, while two blocks in two worlds are thrown at one another, turn and bounce; the trees of
     boxes are built again at every other step."""
-    monkeypatch.setattr("warp_corot.contact.pairs.OWN_TREES", own_trees)
     monkeypatch.setattr("warp_corot.contact.pairs.REBUILT", 2)
     low, high = block(device, 0.0, worlds=2), block(device, 0.0202, cells=(1, 1, 1), at=0.008, worlds=2)
     sim = wc.Simulation([low, high], contact=wc.Contact(self_contact=itself), gravity=(0.0, 0.0, 0.0), integrator=CALM)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -15,6 +16,7 @@ from warp_corot.errors import InputError, StabilityWarning, depth_of_user
 from warp_corot.inputs.checks import checked_number, shown
 from warp_corot.kernels.contact import grasp as kernels
 from warp_corot.mesh import TetForest
+from warp_corot.solvers.system import Constraint
 
 from .tool import Tool
 
@@ -22,7 +24,60 @@ from .tool import Tool
 RIGID = 1000.0
 
 
-class Grasp:
+#: The largest force of a spring without a limit [N].
+UNLIMITED = 1e30
+
+
+class Attachments:
+    """Springs on points of a body, as forces of its system or of an implicit step; all launches may be recorded.
+
+    Args:
+        body: The body.
+
+    Attributes:
+        arrays: The springs and their points, as a struct for kernels.
+    """
+
+    def __init__(self, body: SoftBody):
+        self.body, self.device = body, body.device
+
+    def make(self, rows: int) -> None:
+        """Make room for springs, each of which has one entry."""
+        self.arrays = kernels.Attachments()
+        self.arrays.springs = wp.zeros(rows, dtype=kernels.Spring, device=self.device)
+        self.arrays.points = wp.array(np.arange(rows), dtype=wp.int32, device=self.device)
+        self.arrays.shares = wp.full(rows, 1.0, dtype=wp.float32, device=self.device)
+        self.arrays.softened = wp.zeros(rows, dtype=wp.float32, device=self.device)
+        for name in ("multiplier", "force", "moved"):
+            setattr(self.arrays, name, wp.zeros(rows, dtype=wp.vec3, device=self.device))
+
+    def add_forces(self) -> None:
+        """Launch the springs' forces in the present state."""
+        state = self.body.state
+        self._pull(kernels.pull, [state.displacements, state.velocities, self.arrays, state.forces])
+
+    def add_stiffness(self, body: SoftBody, p: wp.array, y: wp.array) -> None:
+        """Launch y += K p, where K are springs as soft as their limits make them."""
+        if body is self.body:
+            self._pull(kernels.add_products, [self.arrays, p, y])
+
+    def add_diagonal(self, body: SoftBody, blocks: wp.array) -> None:
+        """Launch the addition of the blocks on K's diagonal."""
+        if body is self.body:
+            self._pull(kernels.add_blocks, [self.arrays, blocks])
+
+    def _pull(self, kernel: wp.Kernel, inputs: list) -> None:
+        if len(self.arrays.springs):
+            wp.launch(kernel, len(self.arrays.springs), inputs, device=self.device)
+
+
+def rows_of_springs(count: int) -> npt.NDArray[np.void]:
+    """Springs of zeros, for the host to fill in."""
+    of_spring: Any = kernels.Spring
+    return np.zeros(count, dtype=of_spring.numpy_dtype())
+
+
+class Grasp(Attachments, Constraint):
     """A patch of a body's surface that moves with a tool, from the present places of both until it is released.
 
     It is one of the simulation's constraints as soon as it is made. In implicit steps a rigidly held patch gives way a
@@ -46,6 +101,7 @@ class Grasp:
 
     #: Whether its stiffness couples no two nodes.
     is_diagonal = True
+    launch_revision = 0
 
     def __init__(
         self,
@@ -84,9 +140,9 @@ class Grasp:
         nodes = np.intersect1d(chosen, body.surface_triangles)
         if not len(nodes):
             raise InputError("the patch has no node of the body's surface; it must have one at least")
-        self.body, self.tool, self.device, self._system = body, tool, body.device, system
+        super().__init__(body)
+        self.tool, self._system = tool, system
         self.stiffness = None if stiffness is None else float(stiffness)
-        self.launch_revision = 0
         self.closed, self._reach = closed, min(float(reach), 1e30)
         self._closed = wp.ones(body.worlds, dtype=wp.int32, device=self.device) if closed is None else closed
         self._take(nodes)
@@ -114,13 +170,13 @@ class Grasp:
             self._system.constraints.remove(self)
             # The sum must not return to an earlier value.
             self._system.changes += 1 + self.launch_revision
-            self._forces.zero_()
+            self.arrays.force.zero_()
             self._wrenches.zero_()
 
     def again(self, body: SoftBody) -> Grasp:
         """The same grasp of a body that continues this one's in a simulation that has taken the tool."""
         grasp = Grasp(body, self.nodes, tool=self.tool, stiffness=self.stiffness, closed=self.closed, reach=self._reach)
-        for array, former in ((grasp._places, self._places), (grasp._forces, self._forces)):
+        for array, former in ((grasp._places, self._places), (grasp.arrays.force, self.arrays.force)):
             if len(array) == len(former):
                 wp.copy(array, former)
         return grasp
@@ -136,7 +192,7 @@ class Grasp:
     @property
     def kept(self) -> dict[str, wp.array]:
         """The arrays for a checkpoint: the nodes' places in the tool's frame, and the last forces."""
-        return {"places": self._places, "forces": self._forces, "wrenches": self._wrenches}
+        return {"places": self._places, "forces": self.arrays.force, "wrenches": self._wrenches}
 
     def prepare(self) -> None:
         """Hold the same patch of a changed mesh: its remaining nodes, and new ones between two of them.
@@ -168,54 +224,30 @@ class Grasp:
             self._take_hold(self._obstacles.motions.now)
         inputs = [self._nodes, self._per_world, self._number, self._obstacles.motions, self._places, self._held]
         inputs += [self._stiffness, self._system.pace.arrays, offset]
-        outputs = [self._system.dynamics(self.body, damping), self.body.state.contact_forces, self._forces]
+        outputs = [self._system.dynamics(self.body, damping), self.body.state.contact_forces, self.arrays.force]
         self._launch(kernels.hold_in_tool, inputs, outputs)
 
     def launch_begin(self) -> None:
         """Launch the beginning of an implicit step."""
         if self.closed is not None:
             self._take_hold(self._obstacles.motions.now)
-        if self.stiffness is None and len(self._nodes):
-            wp.copy(self._multipliers, self._forces)
-
-    def add_forces(self) -> None:
-        """Launch its forces in implicit steps, in the present state with the tool at the end of the step."""
-        state = self.body.state
         inputs = [self._nodes, self._per_world, self._number, self._obstacles.motions, self._places, self._held]
-        inputs += [self._implicit_stiffness, self._multipliers, self.body.conditions.inverse_mass]
-        inputs += [state.rest, state.displacements]
-        self._launch(kernels.pull_to_tool, inputs, [state.forces, self._forces])
-
-    def add_stiffness(self, body: SoftBody, p: wp.array, y: wp.array) -> None:
-        if body is self.body:
-            self._launch(kernels.add_hold_product, [self._nodes, self._held, self._implicit_stiffness, p], [y])
-
-    def add_diagonal(self, body: SoftBody, blocks: wp.array) -> None:
-        if body is self.body:
-            self._launch(kernels.add_hold_blocks, [self._nodes, self._held, self._implicit_stiffness], [blocks])
+        inputs += [int(self.stiffness is None), self.body.conditions.inverse_mass, self.body.state.rest]
+        self._launch(kernels.aim, inputs, [self.arrays])
 
     def launch_held(self, body: SoftBody) -> None:
         """Launch the addition of its forces at the end of an implicit step to those of contact."""
         if body is self.body:
-            self._launch(kernels.add_held_forces, [self._nodes, self._forces], [body.state.contact_forces])
-
-    def measure(self) -> None:
-        """Do nothing: a grasp is no faster than its tool."""
+            self._launch(kernels.add_held_forces, [self._nodes, self.arrays.force], [body.state.contact_forces])
 
     def publish(self) -> None:
-        inputs = [self._per_world, self._number, self._obstacles.motions, self._places, self._forces]
+        inputs = [self._per_world, self._number, self._obstacles.motions, self._places, self.arrays.force]
         wp.launch(kernels.sum_held, self.body.worlds, inputs, [self._wrenches], device=self.device)
-
-    def grow(self) -> None:
-        """Do nothing: a grasp needs no room."""
-
-    def forget(self) -> None:
-        """Do nothing: a grasp keeps nothing from the last steps."""
 
     def reset(self, chosen: wp.array) -> None:
         """Open the grasp in chosen worlds, if it opens at all; otherwise it goes on holding."""
         if self.closed is not None:
-            self._launch(kernels.open_grasps, [chosen, self._per_world], [self._held, self._forces])
+            self._launch(kernels.open_grasps, [chosen, self._per_world], [self._held, self.arrays.force])
 
     # --- pieces ----------------------------------------------------------------------------------------------------
 
@@ -244,12 +276,16 @@ class Grasp:
         if body.changing is not None and isinstance(mesh, TetForest):
             self._lattice = list(map(tuple, mesh.lattice[nodes].tolist()))
         self._stiffness = 0.0 if self.stiffness is None else self.stiffness / max(len(nodes), 1)
-        self._implicit_stiffness = self._stiffness or self._rigid_stiffness()
         everywhere = (nodes + body.world_node_count * np.arange(body.worlds)[:, None]).ravel()
         self._nodes = wp.array(everywhere, dtype=wp.int32, device=device)
-        self._places, self._forces, self._multipliers = (
-            wp.zeros(len(everywhere), dtype=wp.vec3, device=device) for _ in range(3)
-        )
+        self._places = wp.zeros(len(everywhere), dtype=wp.vec3, device=device)
+        self.make(len(everywhere))
+        rows = rows_of_springs(len(everywhere))
+        rows["first"], rows["stiffness"] = np.arange(len(rows)), self._stiffness or self._rigid_stiffness()
+        rows["limit"] = UNLIMITED
+        self.arrays.springs = wp.array(rows, dtype=kernels.Spring, device=device)
+        self.arrays.nodes = wp.array(np.repeat(everywhere[:, None], 4, axis=1), dtype=wp.vec4i, device=device)
+        self.arrays.weights = wp.array(np.tile([1.0, 0.0, 0.0, 0.0], (len(rows), 1)), dtype=wp.vec4, device=device)
         # New nodes of a changed mesh are held like those between which they lie.
         self._held = wp.full(len(everywhere), kernels.HELD, dtype=wp.int32, device=device)
         self.launch_revision += 1

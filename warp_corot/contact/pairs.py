@@ -7,11 +7,11 @@ import numpy.typing as npt
 import warp as wp
 
 from warp_corot.errors import UnstableError
-from warp_corot.kernels.contact import boxes, search_by_warp, wide_tree
-from warp_corot.kernels.contact import wide_tree as kernels
+from warp_corot.kernels.contact import boxes, wide_tree
+from warp_corot.kernels.contact import search as kernels
 from warp_corot.kernels.contact.crushed import mark_crushed
 from warp_corot.kernels.contact.rows import Meeting, OldRows, Rows, begin_rows, end_rows, keep_rows
-from warp_corot.kernels.contact.search import find_pairs
+from warp_corot.kernels.contact.search import pair_finder
 from warp_corot.kernels.contact.watch import HIT
 from warp_corot.solvers.halo import ALONE, Halo
 
@@ -24,13 +24,9 @@ PAIRS_EACH = 2
 GROWTH = 2.0
 #: Number of searches after which trees of boxes are built again, because neighbours may have changed by then.
 REBUILT = 100
-#: Up to this many bodies have trees of boxes of their own.
-OWN_TREES = 16
 #: For so many elements at most motion is reserved while nothing is near, if bodies do not touch themselves, and if they
 #: do: then so much of the same body is that near that searches take longer.
 CALM, CALM_ITSELF = 8.0, 1.0
-#: Threads that find the bounds of bodies on CUDA, at most: each warp ends with atomic minima.
-BOUNDING_THREADS = 1 << 15
 
 
 class Pairs:
@@ -86,13 +82,9 @@ class Pairs:
         meeting.normals = wp.zeros(surface.triangle_count, dtype=wp.vec3, device=device)
         meeting.outs = wp.zeros(edges, dtype=wp.vec3, device=device)
         meeting.reach, meeting.ahead = self.search.watch.reach, self.search.watch.ahead
-        shape = (surface.worlds, len(surface.parts))
-        meeting.lower, meeting.upper = (wp.zeros(shape, dtype=wp.vec3, device=device) for _ in range(2))
         meeting.meets_itself, meeting.friction = int(self.meets_itself), self.friction
         meeting.flat_edges = int(self._flat_edges)
-        meeting.groups = len(surface.parts) if len(surface.parts) <= OWN_TREES else 1
-        roots = (2, surface.worlds * meeting.groups)
-        meeting.roots = wp.zeros(roots, dtype=wp.int32, device=device)
+        meeting.roots = wp.zeros((2, surface.worlds, len(surface.parts)), dtype=wp.int32, device=device)
         self.meeting = meeting
         self.tree, self._is_planted = wide_tree.WideTree(), False
         self._boxes = [
@@ -185,9 +177,9 @@ class Pairs:
     def _find_roots(self) -> None:
         """Find the roots of trees that have just been built."""
         self._built = self.search.count
-        roots = self.meeting.roots
-        for number, tree in enumerate(self._trees):
-            wp.launch(boxes.find_roots, roots.shape[1], [tree.id], [roots[number]], device=self.device)
+        for k, tree in enumerate(self._trees):
+            roots = self.meeting.roots[k]
+            wp.launch(boxes.find_roots, roots.size, [tree.id], [roots.flatten()], device=self.device)
 
     def forget(self) -> None:
         """Forget the forces of the last step."""
@@ -209,20 +201,15 @@ class Pairs:
         self._box()
         if device.is_cpu:
             self._fill()
-        else:
-            if not self.meets_itself or self.meeting.groups > 1:
-                self._bound()
-            for tree in self._trees:
-                tree.refit()
+        for tree in self._trees:
+            tree.refit()
         owners = len(rows.starts)
         wp.launch(keep_rows, owners, [watch, rows, old], device=device)
         wp.launch(begin_rows, 1, [watch, rows], device=device)
-        given, outputs = [self.surface.arrays, self.meeting, old], [rows, self.search.near]
-        if device.is_cpu:
-            wp.launch(find_pairs, owners, [watch, self.tree, *given], outputs, device=device)
-        else:
-            trees, threads = [tree.id for tree in self._trees], owners * int(search_by_warp.LANES)
-            wp.launch(search_by_warp.find_pairs_by_warp, threads, [watch, *trees, *given], outputs, device=device)
+        trees = [self.tree, *([tree.id for tree in self._trees] or (0, 0))]
+        threads = owners * (1 if device.is_cpu else int(kernels.LANES))
+        inputs = [watch, *trees, self.surface.arrays, self.meeting, old]
+        wp.launch(pair_finder(device.is_cpu), threads, inputs, [rows, self.search.near], device=device)
         wp.launch(end_rows, 1, [watch, rows], [self.search.most], device=device)
 
     def _fill(self) -> None:
@@ -236,27 +223,16 @@ class Pairs:
             wp.launch(wide_tree.fill_nodes, leaves // lanes ** (k + 1), [watch, children], [nodes], device=self.device)
 
     def _groups(self) -> list[wp.array]:
-        """The group of each triangle and of each edge: its body in its world, or its world; see ``Meeting``."""
-        parts, worlds, each = self.surface.parts, self.surface.worlds, self.meeting.groups
+        """The group of each triangle and of each edge: its body in its world; see ``Meeting``."""
+        parts, worlds = self.surface.parts, self.surface.worlds
         found = []
         for name, (lower, _) in zip(("triangles", "edges"), self._boxes, strict=True):
             of_parts = [
-                np.repeat(each * np.arange(worlds) + min(k, each - 1), getattr(part, name))
-                for k, part in enumerate(parts)
+                np.repeat(len(parts) * np.arange(worlds) + k, getattr(part, name)) for k, part in enumerate(parts)
             ]
             groups = np.concatenate(of_parts).astype(np.int32)
             found.append(wp.array(np.resize(groups, len(lower)), dtype=wp.int32, device=self.device))
         return found
-
-    def _bound(self) -> None:
-        """Launch the bounds of what each body may reach; no pairs are searched for outside."""
-        watch, meeting, device = self.search.watch, self.meeting, self.device
-        bounds = [meeting.lower, meeting.upper]
-        wp.launch(boxes.clear_bounds, meeting.lower.shape, [watch], bounds, device=device)
-        warps = -(-min(self.surface.triangle_count, BOUNDING_THREADS) // boxes.LANES)
-        threads = 1 if device.is_cpu else boxes.LANES * max(warps, 1)
-        inputs = [threads, watch, self.surface.arrays, meeting]
-        wp.launch(boxes.bound_bodies, threads, inputs, bounds, device=device)
 
     def _mark_crushed(self) -> None:
         near, watch = self.search.near, self.search.watch
@@ -275,7 +251,7 @@ def smallest_size(volumes: list[float]) -> float:
 
 # --- the tree of the CPU ----------------------------------------------------------------------------------------------
 
-LANES = int(kernels.LANES)
+LANES = int(wide_tree.LANES)
 #: Leaves of a root.
 OF_ROOT = LANES * LANES
 
@@ -283,9 +259,9 @@ Ints = npt.NDArray[np.integer]
 Floats = npt.NDArray[np.float32]
 
 
-def planted(surface: ContactSurface) -> kernels.WideTree:
+def planted(surface: ContactSurface) -> wide_tree.WideTree:
     """The tree of surfaces whose places at rest are known; boxes are not."""
-    tree, corners, sides = kernels.WideTree(), surface.triangles.numpy(), surface.sides.numpy()[:, 0]
+    tree, corners, sides = wide_tree.WideTree(), surface.triangles.numpy(), surface.sides.numpy()[:, 0]
     used = np.flatnonzero(corners[:, 0] >= 0)
     bodies, parts = surface.body_of_places(), len(surface.parts)
     group = surface.arrays.world.numpy()[corners[used, 0]] * parts + bodies[corners[used, 0]]
@@ -308,8 +284,8 @@ def planted(surface: ContactSurface) -> kernels.WideTree:
     sizes |= {"upper_nodes": leaves // LANES, "roots": -(-leaves // OF_ROOT // LANES) * LANES}
     for name, values in arrays.items():
         setattr(tree, name, wp.array(values.astype(np.int32), dtype=wp.int32, device=surface.device))
-    empty = np.full((int(kernels.ROWS), LANES), 0.0, np.float32)
-    empty[:3], empty[3:6] = kernels.FAR, -kernels.FAR
+    empty = np.full((int(wide_tree.ROWS), LANES), 0.0, np.float32)
+    empty[:3], empty[3:6] = wide_tree.FAR, -wide_tree.FAR
     for name, size in sizes.items():
         values = np.tile(empty.ravel(), size // LANES)
         setattr(tree, name, wp.array(values, dtype=wp.float32, device=surface.device))

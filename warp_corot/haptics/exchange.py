@@ -119,24 +119,6 @@ class HapticExchange(Constraint):
 
     # --- the simulation's side: only what is published counts -----------------------------------------------------
 
-    def prepare(self) -> None:
-        return
-
-    def launch(self, offset: int, damping: float) -> None:
-        return
-
-    def grow(self) -> None:
-        return
-
-    def forget(self) -> None:
-        return
-
-    def measure(self) -> None:
-        return
-
-    def reset(self, chosen: wp.array) -> None:
-        return
-
     def publish(self) -> None:
         obstacles, device = self._obstacles, self._system.device
         inputs = [self._number, obstacles.wrenches, obstacles.motions, self._system.pace.arrays]

@@ -40,7 +40,7 @@ from warp_corot.inputs.loading import (
 )
 from warp_corot.inputs.simulation_lock import SIMULATION_LOCK, under_lock
 from warp_corot.kernels.contact.crushed import count_crushed
-from warp_corot.kernels.contact.search import find_pairs
+from warp_corot.kernels.contact.search import pair_finder
 from warp_corot.kernels.elements.elements import ForestElements
 from warp_corot.kernels.stepping.integrate import STEP_SYMPLECTIC_EULER
 from warp_corot.kernels.stepping.stability import find_strains
@@ -215,7 +215,7 @@ class Simulation(Cutting):
         kernels += [find_strains(body.discretization.element_kind) for body in self.parts if chosen]
         kernels += [count_crushed(body.discretization.element_kind) for body in self.parts if touching]
         if meet:
-            kernels.append(find_pairs)
+            kernels.append(pair_finder(self.device.is_cpu))
         if touching and explicit:
             kernels.append(solver_of(self.device, *touching, len(self.parts)))
         kernels += [kernel for field in self.fields for kernel in field.kernels]

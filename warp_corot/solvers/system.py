@@ -127,7 +127,7 @@ class Constraint(Protocol):
     """Forces that react to the motion that all other forces would cause in a step, such as contact.
 
     Its forces are part of ``state.forces`` and, alone, of ``state.contact_forces``, from which their work is counted. A
-    constraint that counts it itself says ``counts_work = True``.
+    constraint that counts it itself says ``counts_work = True``. Subclasses need only the methods that do something.
 
     Attributes:
         launch_revision: Changes whenever its launches do, so that steps must be recorded again.
@@ -142,7 +142,7 @@ class Constraint(Protocol):
 
     def prepare(self) -> None:
         """Follow changes of the bodies' meshes; called before steps are launched, never while they are recorded."""
-        ...
+        return
 
     def launch(self, offset: int, damping: float) -> None:
         """Launch the kernels that add its forces to ``state.forces`` and ``state.contact_forces`` of the bodies, after
@@ -152,7 +152,7 @@ class Constraint(Protocol):
             offset: Number of launched steps that the clock does not count yet.
             damping: Rate of mass-proportional damping of the step [1/s].
         """
-        ...
+        return
 
     @property
     def is_full(self) -> bool:
@@ -165,23 +165,23 @@ class Constraint(Protocol):
         Raises:
             UnstableError: No room is enough: something goes too far in one step.
         """
-        ...
+        return
 
     def forget(self) -> None:
         """Forget what the last steps left, because they are taken back."""
-        ...
+        return
 
     def measure(self) -> None:
         """Launch the measurement of how fast things move for their size; see ``System.motion_rates``."""
-        ...
+        return
 
     def publish(self) -> None:
         """Launch the update of what users read after a run of steps."""
-        ...
+        return
 
     def reset(self, chosen: wp.array) -> None:
         """Forget what belongs to worlds that are reset, nonzero in int32 [worlds]."""
-        ...
+        return
 
 
 class System:

@@ -4,27 +4,27 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 import numpy.typing as npt
 import warp as wp
 
 from warp_corot.body.soft_body import SoftBody
-from warp_corot.contact.grasp import Grasp
+from warp_corot.contact.grasp import Attachments, Grasp, rows_of_springs
 from warp_corot.contact.obstacles import LARGEST_SHARE
 from warp_corot.contact.shapes import Capsule, Shape, Sphere, turn_from_z
 from warp_corot.contact.tool import Tool
 from warp_corot.cutting.blade import Blade, Edge
 from warp_corot.errors import InputError
 from warp_corot.inputs.checks import checked_choice, checked_vector
-from warp_corot.kernels.viewing import hands as kernels
+from warp_corot.kernels.contact import grasp as kernels
 from warp_corot.simulation.simulation import Simulation
 from warp_corot.solvers import SymplecticEuler, largest_frequency
 
 from .shown import Pick, Shown
 
-#: Maximum number of hands on a body at the same time, and of points in a patch: one thread loops over them.
+#: Maximum number of hands on a body at the same time, and of points in a patch.
 MOST_HANDS, MOST_POINTS = 8, 64
 #: The square of the spring's own frequency times the longest step; the limit is 4, of which elasticity takes up to 3.3.
 STIFF = 0.2
@@ -50,24 +50,22 @@ class HeldPatch:
 
 
 class Springs:
-    """The springs of all hands of a simulation, among the forces of its system from the first hold on.
+    """The springs of all hands of a simulation, among the forces of its system from a body's first hold on.
 
     Args:
         sim: The simulation.
         shown: The shown surface of each body.
-
-    Attributes:
-        revision: Changes when a body is first held, since its launches then begin.
     """
 
     def __init__(self, sim: Simulation, shown: Sequence[Shown]):
-        self.sim, self.shown, self.revision = sim, shown, 0
+        self.sim, self.shown = sim, shown
         self._bodies: dict[int, BodySprings] = {}
 
     def close(self) -> None:
         """Let everything go and leave the simulation."""
-        if self in self.sim.system.forces:
-            self.sim.system.forces.remove(self)
+        for springs in self._bodies.values():
+            self.sim.system.forces.remove(springs)
+        self.sim.system.changes += 2 * len(self._bodies)
         self._bodies.clear()
 
     def hold(self, body: int, patch: HeldPatch, *, rigid: bool, strength: float = 1.0) -> Spring:
@@ -82,38 +80,15 @@ class Springs:
         Raises:
             LookupError: The maximum number of hands hold the body already.
         """
-        if not self._bodies:
-            self.sim.system.forces.append(self)
         if body not in self._bodies:
             self._bodies[body] = BodySprings(self.sim, self.shown[body])
-            self.revision += 1
+            self.sim.system.forces.append(self._bodies[body])
         return self._bodies[body].hold(patch, rigid, strength)
 
     def refit(self) -> None:
         """Find the stiffness again if the meshes or their nodes' masses have changed."""
         for springs in self._bodies.values():
             springs.refit()
-
-    # --- as forces of the system; all launches may be recorded ------------------------------------------------------
-
-    def add_forces(self) -> None:
-        """Launch the forces of all hands."""
-        for springs in self._bodies.values():
-            state = springs.body.state
-            inputs = [*springs.places, springs.starts, state.displacements, state.velocities]
-            springs.launch(kernels.pull, [*inputs, state.forces, springs.found, springs.softened])
-
-    def add_stiffness(self, body: SoftBody, p: wp.array, y: wp.array) -> None:
-        """Launch y += K p, where K are springs as soft as their limits make them."""
-        for springs in self._bodies.values():
-            if springs.body is body:
-                springs.launch(kernels.add_products, [*springs.places, springs.softened, p, y])
-
-    def add_diagonal(self, body: SoftBody, blocks: wp.array) -> None:
-        """Launch the addition of the blocks on K's diagonal."""
-        for springs in self._bodies.values():
-            if springs.body is body:
-                springs.launch(kernels.add_blocks, [*springs.places, springs.softened, blocks])
 
 
 class Spring:
@@ -122,16 +97,18 @@ class Spring:
     Attributes:
         stiffness: Stiffness of the spring, for the whole patch [N/m].
         limit: The largest force on it [N].
-        slot: Its place among the hands of the body.
-        motion: How far the hand has moved since it took hold [m], float64 [3].
+        rows: Its rows among those of the body.
+        starts: Displacements of the points when the hand took hold [m], float64 [k, 3].
+        motion: How far the hand has moved since then [m], float64 [3].
     """
 
     def __init__(self, owner: BodySprings, slot: int, patch: HeldPatch, rigid: bool, strength: float):
-        self._owner, self.slot = owner, slot
+        self._owner, self.slot, self.rows = owner, slot, slice(slot * MOST_POINTS, (slot + 1) * MOST_POINTS)
         self.patch, self.rigid, self.strength = patch, rigid, strength
         self.stiffness = self.damping = self.limit = 0.0
         self.motion: npt.NDArray[np.float64] = np.zeros(3)
-        self.start: npt.NDArray[np.float64] = np.zeros(3)
+        nodes, weights = owner.bound(patch)
+        self.starts = np.einsum("pn,pnc->pc", weights, owner.body.state.displacements.numpy()[nodes, :3])
 
     def move(self, motion: npt.ArrayLike) -> None:
         """Set the hand's distance from where it took hold [m], [3]."""
@@ -145,56 +122,47 @@ class Spring:
     @property
     def force(self) -> npt.NDArray[np.float64]:
         """The force on the body in the last step [N], float64 [3]; waits for the device."""
-        return self._owner.found.numpy()[self.slot, 0].astype(np.float64)
+        return self._owner.arrays.force.numpy()[self.rows].astype(np.float64).sum(axis=0)
 
     @property
     def ends(self) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
         """The middle of the patch, and the place to which the hand pulls it [m], float64 [3] each."""
-        middle = self.patch.shares @ self._owner.shown.rest[self.patch.points]
-        moved = self._owner.found.numpy()[self.slot, 1].astype(np.float64)
-        return middle + moved, middle + self.start + self.motion
+        shares = self.patch.shares
+        middle = shares @ self._owner.shown.rest[self.patch.points]
+        moved = self._owner.arrays.moved.numpy()[self.rows].astype(np.float64)
+        mean = shares @ moved[: len(shares)] if self.rigid else moved[0]
+        return middle + mean, middle + shares @ self.starts + self.motion
 
 
-class BodySprings:
-    """The springs that hold one body.
-
-    Attributes:
-        starts: Displacements of the points of each patch when a hand took hold [m], vec3 [hands, points].
-        found: Force [N] and mean displacement [m] of every hand in the last step, vec3 [hands, 2].
-        softened: Stiffness of the springs as their limits make them [N/m], float32 [hands, points].
-    """
+class BodySprings(Attachments):
+    """The springs that hold one body: each hand has as many rows as a patch may have points, one for each point that it
+    holds, or one for their mean."""
 
     def __init__(self, sim: Simulation, shown: Shown):
-        self.sim, self.shown, self.body = sim, shown, shown.body
-        device, size = self.body.device, (MOST_HANDS, MOST_POINTS)
+        super().__init__(shown.body)
+        self.sim, self.shown = sim, shown
         self._held: list[Spring | None] = [None] * MOST_HANDS
-        self._springs = wp.zeros(MOST_HANDS, dtype=kernels.Spring, device=device)
-        self._patches = wp.zeros(size, dtype=wp.int32, device=device)
-        self._shares = wp.zeros(size, dtype=wp.float32, device=device)
-        self.starts = wp.zeros(size, dtype=wp.vec3, device=device)
-        self.found = wp.zeros((MOST_HANDS, 2), dtype=wp.vec3, device=device)
-        self.softened = wp.zeros(size, dtype=wp.float32, device=device)
         self._explicit_dt: float | None = None
+        self.make(MOST_HANDS * MOST_POINTS)
 
-    @property
-    def places(self) -> list[wp.array]:
-        """The first inputs of all launches."""
-        return [self._springs, self._patches, self._shares, self.shown.nodes, self.shown.binding.weights]
+    def _pull(self, kernel: wp.Kernel, inputs: list) -> None:
+        self.arrays.nodes, self.arrays.weights = self.shown.nodes, self.shown.binding.weights
+        super()._pull(kernel, inputs)
 
-    def launch(self, kernel: wp.Kernel, inputs: list[wp.array]) -> None:
-        wp.launch(kernel, MOST_HANDS, inputs, device=self.body.device)
+    def bound(self, patch: HeldPatch) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.float64]]:
+        """The nodes that carry each point of a patch, and their weights, [k, 4] each."""
+        # Copied, since a view of a device's array may be the array itself.
+        nodes, weights = (each.numpy()[patch.points] for each in (self.shown.nodes, self.shown.binding.weights))
+        return np.array(nodes), np.array(weights, np.float64)
 
     def hold(self, patch: HeldPatch, rigid: bool, strength: float) -> Spring:
         if None not in self._held:
             raise LookupError(f"{MOST_HANDS} hands hold the body already")
         slot = self._held.index(None)
         spring = self._held[slot] = Spring(self, slot, patch, rigid, strength)
-        count = len(patch.points)
-        self._patches[slot, :count].assign(patch.points.astype(np.int32))
-        self._shares[slot, :count].assign(patch.shares.astype(np.float32))
-        inputs = [self._patches[slot], self.shown.nodes, self.shown.binding.weights, self.body.state.displacements]
-        wp.launch(kernels.take_hold, count, inputs, [self.starts[slot]], device=self.body.device)
-        spring.start = patch.shares @ self.starts[slot].numpy()[:count]
+        own = slice(spring.rows.start, spring.rows.start + len(patch.points))
+        self.arrays.points[own].assign(patch.points.astype(np.int32))
+        self.arrays.shares[own].assign(np.where(rigid, 1.0, patch.shares).astype(np.float32))
         self._fit(spring)
         self.write(slot)
         return spring
@@ -212,20 +180,21 @@ class BodySprings:
 
     def write(self, slot: int) -> None:
         """Copy a hand to the device."""
-        spring = self._held[slot]
-        of_spring: Any = kernels.Spring
-        row: Any = np.zeros(1, dtype=of_spring.numpy_dtype())
+        spring, rows = self._held[slot], rows_of_springs(MOST_POINTS)
+        first = slot * MOST_POINTS
         if spring is not None:
-            row["motion"], row["stiffness"], row["damping"] = spring.motion, spring.stiffness, spring.damping
-            row["limit"], row["rigid"], row["count"] = spring.limit, int(spring.rigid), len(spring.patch.points)
-        given = wp.array(row, dtype=kernels.Spring, device=self.body.device)
-        wp.copy(self._springs, given, dest_offset=slot, count=1)
+            shares = spring.patch.shares
+            count, of_rows = (len(shares), shares) if spring.rigid else (1, np.ones(1))
+            rows["first"], rows["count"][:count] = first + np.arange(MOST_POINTS), len(shares) // count
+            rows["target"][:count] = spring.motion + (spring.starts if spring.rigid else shares @ spring.starts)
+            for name in ("stiffness", "damping", "limit"):
+                rows[name][:count] = of_rows * getattr(spring, name)
+        given = wp.array(rows, dtype=kernels.Spring, device=self.device)
+        wp.copy(self.arrays.springs, given, dest_offset=first, count=MOST_POINTS)
 
     def _fit(self, spring: Spring) -> None:
         """The stiffness and the damping that are stable at the time step."""
-        # Copied, since a view of a device's array may be the array itself.
-        nodes = np.array(self.shown.nodes.numpy()[spring.patch.points])
-        weights = np.array(self.shown.binding.weights.numpy()[spring.patch.points], dtype=np.float64)
+        nodes, weights = self.bound(spring.patch)
         weights *= spring.patch.shares[:, None]
         used, place = np.unique(nodes, return_inverse=True)
         total = np.bincount(place.ravel(), np.abs(weights).ravel(), len(used))

@@ -352,7 +352,7 @@ class Session:
         """Compile what frames, hands and the page's tools launch, several modules at a time."""
         explicit = not self.sim.system.is_implicit
         contact = CONTACT_ON_CPU if explicit and not self.sim.device.is_cuda else ()
-        load(["viewing.hands", *contact], self.sim.device)
+        load(["contact.grasp", *contact], self.sim.device)
         self.sim.advance_steps(1)
         self.frame()
 
