@@ -19,7 +19,6 @@ from warp_corot.mesh.topology import linked, node_pairs
 from warp_corot.solvers.pace import Mapped
 from warp_corot.solvers.stability import Curvature, largest_eigenvalue
 
-from .contact import Contacts
 from .library import newton
 from .others import Others
 from .tetrahedra import Tetrahedra
@@ -62,9 +61,7 @@ class _SmallMotions:
         return nullcontext()
 
 
-def stable_step(
-    tets: Tetrahedra, others: Others, stiffness: float = 0.0, damping: float = 0.0, of_bodies: float = 0.0
-) -> float:
+def stable_step(tets: Tetrahedra, others: Others, stiffness: float = 0.0, damping: float = 0.0) -> float:
     """The largest stable step of symplectic Euler about rest [s]; infinite if nothing can move.
 
     It is stable while no eigenvalue of dt^2 M^-1 K + 2 dt M^-1 C is above 4. With w^2 the largest eigenvalue of M^-1 K
@@ -74,10 +71,8 @@ def stable_step(
 
     Args:
         tets, others: The parts of the model.
-        stiffness: Stiffness of a spring at every particle [N/m], for contact.
+        stiffness: Stiffness of a spring at every particle [N/m], for contact with other particles.
         damping: Damping of a damper at every particle [N s/m].
-        of_bodies: Stiffness over mass at the other end of this spring [1/s^2]; 0: that end does not move. Bodies that
-            are touched in several places need no shorter steps; see ``kernels.newton.explicit``.
     """
     inverse = free_inverse_masses(tets.model)
     inverse_mass = wp.array(inverse, dtype=wp.float32, device=tets.device)
@@ -85,7 +80,7 @@ def stable_step(
 
     def largest(a: float, b: float) -> float:
         motions = _SmallMotions(tets, others, a, b, stiffness, damping)
-        return largest_eigenvalue(motions, inverse_mass, smallest, len(inverse)) + a * of_bodies
+        return largest_eigenvalue(motions, inverse_mass, smallest, len(inverse))
 
     w2 = largest(1.0, 0.0)
     if not (tets.damped or others.damped or damping > 0):
@@ -109,14 +104,10 @@ def free_inverse_masses(model: newton.Model) -> npt.NDArray[np.floating]:
     return np.where(active, model.particle_inv_mass.numpy(), 0.0)
 
 
-def stable_steps(tets: Tetrahedra, others: Others, contacts: Contacts) -> tuple[float, float]:
-    """The largest stable step about rest [s], and the same with a contact or an attachment at every particle."""
+def stable_steps(tets: Tetrahedra, others: Others) -> tuple[float, float]:
+    """The largest stable step about rest [s], and the same with contacts of each particle with others."""
     alone = stable_step(tets, others)
-    stiffness, damping = others.contact
-    stiffness += contacts.stiffest
-    if not (stiffness > 0 or damping > 0):
-        return alone, alone
-    return alone, min(alone, stable_step(tets, others, stiffness, damping, contacts.stiffest * contacts.lightest))
+    return alone, min(alone, stable_step(tets, others, *others.contact)) if any(others.contact) else alone
 
 
 def check_substep(dt: float, count: int, stable_dt: float, contact_dt: float) -> None:
