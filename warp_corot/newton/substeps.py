@@ -33,6 +33,9 @@ RETRIES = 4
 RECOVERY = 1.02
 #: Fraction of the largest stable step that errors suggest: elements stiffen when strained.
 SAFETY = 0.7
+#: The way of a particle that may meet something in a substep, over the size of the smallest element: contact is no
+#: stiffer than elements, so that a body that falls as fast as waves travel in it would sink in as far as it does.
+STRIDE = 0.5
 #: Number of attempts to lengthen a step, and the largest eigenvalue, of 4, from which it is long enough.
 LENGTHENINGS = 6
 ENOUGH = 3.95
@@ -146,7 +149,7 @@ class Following:
         self.model, self.tetrahedra = model, tetrahedra
         self.device = model.device
         self._f = wp.zeros(model.particle_count, dtype=wp.vec4, device=self.device)
-        self._found = wp.zeros((1, 2), dtype=wp.float32, device=self.device)
+        self._found = wp.zeros((1, 3), dtype=wp.float32, device=self.device)
         self._curvature = Curvature(model.particle_count, self._found[0])
         self._at_rest = wp.zeros((1, 4), dtype=wp.float64, device=self.device)
         self._allowed = wp.zeros(1, dtype=wp.float64, device=self.device)
@@ -170,6 +173,10 @@ class Following:
         curvature = self._curvature.at_rest(tets.add_linear_forces, self._inverse_mass, len(inverse))
         row = [stable, curvature, Corotated.step_safety, Corotated.strained_safety]
         self._longest = stable * Corotated.step_safety
+        self._stride, self._falls = 0.0, INTERVAL * float(np.linalg.norm(self.model.gravity.numpy(), axis=1).max())
+        if self.model.shape_count:
+            self._stride = STRIDE * float(tets.elements.volume.numpy().min()) ** (1 / 3)
+            self._longest = min(self._longest, math.sqrt(self._stride / max(self._falls, 1e-30)))
         if not math.isfinite(stable):
             row[0] = self._longest = 1e30
         self._at_rest.assign(np.array([row]))
@@ -218,7 +225,7 @@ class Following:
         looked_at = -(-model.tet_count // int(stability.TURNS))
         self._launch(of_elements.find_posed_strains, inputs, [self._found], looked_at)
         recorded = substep if self.device.is_capturing else 0.0
-        inputs = [self._at_rest, wp.float64(recorded)]
+        inputs = [self._at_rest, wp.float64(recorded), self._stride, self._falls]
         outputs = [self._found, self._allowed, self._turn, self._excess, self._seen.array]
         self._launch(of_elements.take_safe_substep, inputs, outputs, 1)
         self.recover()
