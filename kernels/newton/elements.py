@@ -34,6 +34,8 @@ from warp_corot.kernels.stepping.stability import TURNS, keep_largest
 
 wp.set_module_options({"enable_backward": False})
 
+#: The place of the largest speed among measurements.
+SPEED = wp.constant(2)
 #: Number of tetrahedra that a thread checks for activation.
 EACH = wp.constant(4)
 
@@ -225,8 +227,8 @@ def find_posed_strains(
     # Out
     found: wp.array2d[wp.float32],
 ):
-    """The largest entry of F^T F - I among one in ``TURNS`` elements, now and after ``ahead`` [s] at the current rate;
-    the next measurement checks others."""
+    """The largest entry of F^T F - I among one in ``TURNS`` elements, now and after ``ahead`` [s] at the current rate,
+    and the largest speed of their first nodes; the next measurement checks others."""
     t = wp.tid() * TURNS + turn[0] % TURNS
     if t >= count:
         return
@@ -239,6 +241,13 @@ def find_posed_strains(
         for j in range(3):
             most = wp.max(most, wp.max(wp.abs(strain[i, j]), wp.abs(later[i, j])))
     keep_largest(most, STRAIN, found[0])
+    keep_largest(wp.length(qd[elements.nodes[t][0]]), SPEED, found[0])
+
+
+@wp.func
+def longest_stride(stride: float, falls: float, speed: float):
+    """The substep dt [s] with dt (speed + falls dt) = stride [m]."""
+    return 2.0 * stride / (speed + wp.sqrt(speed * speed + 4.0 * falls * stride) + 1.0e-30)
 
 
 @wp.kernel(enable_backward=False)
@@ -246,6 +255,8 @@ def take_safe_substep(
     # In
     at_rest: wp.array2d[wp.float64],
     recorded: wp.float64,
+    stride: float,
+    falls: float,
     # In and out
     found: wp.array2d[wp.float32],
     allowed: wp.array[wp.float64],
@@ -258,11 +269,15 @@ def take_safe_substep(
 
     Args:
         recorded: Length of the substep of a recorded step [s]; zero if the host chooses the next one.
+        stride: The longest way of a particle in a substep [m], which may meet something, or zero.
+        falls: How much faster it may be at the next measurement, over the substep [m/s^2].
         excess: Largest factor by which a recorded one was too long.
         seen: The safe substep, in the host's memory.
     """
     longest = at_rest[0, SAFE] * at_rest[0, STABLE]
     safe = wp.min(longest, safe_step(at_rest, found, 0))
+    if stride > 0.0:
+        safe = wp.min(safe, wp.float64(longest_stride(stride, falls, found[0, SPEED])))
     safe = wp.min(wp.max(safe, LEAST * longest), GROWTH * allowed[0])
     allowed[0] = safe
     seen[0] = safe

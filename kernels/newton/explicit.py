@@ -3,20 +3,16 @@
 Forces on particles and bodies are opposite, so momentum is exchanged exactly. Damping and friction do not reverse a
 relative velocity within a step, however light particle and body are: the part of the law that would do so is left out.
 A body that is touched in n places counts in each as a piece of 1/n of its mass and inertia, which bounds their total
-effect; particles in many contacts likewise, see ``rows``. If every contact has a particle of its own, one that touches
-several shapes is still slowed down by each.
+effect; particles in many contacts likewise, see ``rows``.
 
-Together, the springs of many contacts are far too stiff for explicit steps of a light body. So they act
-on the body not at its position but at the one to which it would yield: their energy V becomes its Moreau envelope in
-the metric of the body's mass matrix M,
+Springs may be far too stiff for explicit steps of light particles and bodies. So a spring k acts where its ends would
+yield to it: its energy V becomes its Moreau envelope in the metric of their masses,
 
-    V'(x, b) = min over d of V(x, b + d) + d . M d / (2 dt^2),
+    V'(x) = min over d of V(x + d) + d . M d / (2 a dt^2),
 
-with particles x, the body b, and its small displacement and rotation d. The gradient is that of V at b + d: every
-spring still connects a particle and the body, only shorter. V' is an energy, so contacts that come and go add none;
-M^-1 times its curvature is below 1/dt^2 for any number and stiffness of springs; without stiff springs, d vanishes. At
-rest springs carry the same forces, with the body deeper by g dt^2. V is quadratic except for the set of closed
-contacts, so Newton's method finds d.
+with these pieces' masses M and a = ``YIELDS``. The spring only becomes softer, 1/k' = 1/k + a dt^2 w with the inverse
+mass w of its ends. V' is an energy, so contact adds none; M^-1 times the curvature of all springs together is at most
+1/(a dt^2), whatever their number and stiffness. At rest a spring carries the same force, deeper by a dt^2 w times it.
 
 Contact of soft surfaces with one another: vertices with triangles and edges with edges, as Newton's detector lists
 them.
@@ -24,8 +20,8 @@ them.
 A vertex at the distance d from a triangle has the energy k (margin - d)^2 / 2 while d < margin. It is a function of
 positions only, and so adds no energy. Edges that are closest at their ends repeat this: their force is multiplied by a
 measure from 0 there to 1 in the middle. Surfaces of tetrahedra have an inside: there d becomes negative if the vertex
-or edge belongs to another body, so that what has sunk in is pushed out. Cloth has two sides. Loads are those of
-``rows``; a pair counts twice, because its two sides may move against one another. What is closer at
+or edge belongs to another body, so that what has sunk in is pushed out. Cloth has two sides. In loads, see ``rows``, a
+pair that touches counts twice, because its two sides may move against one another. What is closer at
 first than the margin has this distance as its margin, so that nothing starts with a push: between bodies no less than
 a fraction of the margin, to keep cloth apart.
 """
@@ -35,7 +31,6 @@ import warp as wp
 from warp_corot.kernels.contact.closest import on_triangle
 from warp_corot.kernels.contact.law import held_back
 from warp_corot.kernels.contact.vertices import across
-from warp_corot.kernels.implicit.assembled import root_columns
 
 from .particles import TOO_MANY_PAIRS, Bodies, Particles, is_fixed, mark
 from .rows import (
@@ -50,14 +45,15 @@ from .rows import (
     no_row,
     point_and_arm,
     pull_of,
-    share_of,
     sum_of,
 )
 
 wp.set_module_options({"enable_backward": False})
 
-#: If a body yields entirely to springs, this fraction of the strongest damper acts, too: explicit steps return up
-#: to a quarter more energy than they took from a contact that lasts only a few of them.
+#: See above. Elasticity at its largest stable step with its margin leaves room for this curvature.
+YIELDS = wp.constant(1.5)
+#: If only a body yields to a spring, this fraction of the strongest damper acts, too: explicit steps return up to a
+#: quarter more energy than they took from a contact that lasts only a few of them.
 LOSS = wp.constant(0.5)
 #: More than any damping.
 NO_LIMIT = wp.constant(1.0e30)
@@ -95,23 +91,21 @@ def largest_damping(w: float, dt: float):
 
 
 @wp.func
-def contact_force(
-    row: Row, gap: float, yielded: float, v: wp.vec3, pull: wp.vec3, m: Mobility, share: float, dt: float
-):
+def contact_force(row: Row, gap: float, v: wp.vec3, pull: wp.vec3, m: Mobility, dt: float):
     """Force on the particles [N]: spring and damper along the normal, regularised Coulomb friction across it.
 
     Args:
-        gap: Gap after the body has yielded.
-        yielded: Fraction of the gap that yielding closes.
         v: Velocity of the particles relative to the body's point.
         pull: Change of this velocity by all other forces in this step [m/s].
-        share: The share of its stiffness that the contact has.
     """
     n = row.normal
     towards = wp.dot(n, v)
-    push = -share * row.stiffness * gap
+    w = m.particle + body_mobility(m, n)
+    soft = YIELDS * row.stiffness * dt * dt
+    push = -row.stiffness * gap / (1.0 + soft * w)
     if gap < 0.0 and towards < 0.0:
-        largest = largest_damping(m.particle + body_mobility(m, n), dt)
+        largest = largest_damping(w, dt)
+        yielded = soft * (w - m.particle) / (1.0 + soft * w)
         push -= wp.min(row.damping + LOSS * yielded * largest, largest) * towards
     # Implicit in the velocity that there would be without friction. With the current velocity, a force on a light
     # particle would move it by one step's change of velocity in every step, however strong the friction.
@@ -123,6 +117,17 @@ def contact_force(
         drag = sliding / (1.0 / row.slope + 1.0 / largest)
         force -= held_back(drag, wp.max(push, 0.0), row.friction)
     return row.measure * force
+
+
+@wp.func
+def attachment_force(row: Row, apart: wp.vec3, v: wp.vec3, m: Mobility, dt: float):
+    """Force on the particle [N]: a spring and a damper."""
+    arm = wp.skew(m.arm)
+    w = (m.particle + m.linear) * wp.identity(3, dtype=wp.float32) + arm * m.angular * wp.transpose(arm)
+    # The sum over three directions exceeds any single one.
+    damping = wp.min(row.damping, largest_damping(wp.trace(w), dt))
+    soft = wp.identity(3, dtype=wp.float32) + (YIELDS * row.stiffness * dt * dt) * w
+    return -row.stiffness * (wp.inverse(soft) * apart) - damping * v
 
 
 @wp.kernel(enable_backward=False)
@@ -161,15 +166,14 @@ def scatter_rows(
     body = row.body
     point, arm = point_and_arm(row, bodies)
     velocity = row.velocity
-    give = wp.vec3()
     m = Mobility()
     m.arm = arm
+    m.particle = inverse_mass_of(row, load, particles)
     if body >= 0:
         pose = bodies.q[body]
         velocity = wp.transform_vector(pose, velocity) + body_point_velocity(bodies.qd[body], arm)
-        give = body_point_velocity(bodies.yielding[body], arm)
         if not is_fixed(body, bodies):
-            n = float(wp.max(bodies.places[body], 1))
+            n = bodies.places[body]
             turn = wp.quat_to_matrix(wp.transform_get_rotation(pose))
             m.linear = n * bodies.inv_mass[body]
             m.angular = n * (turn * bodies.inv_inertia[body] * wp.transpose(turn))
@@ -177,132 +181,18 @@ def scatter_rows(
     v = sum_of(row, qd) - velocity
     force = wp.vec3()
     if is_attachment(row):
-        # The sum over three directions exceeds any single one.
-        w = particles.inv_mass[row.nodes[0]] + body_mobility(m, wp.vec3(1.0, 0.0, 0.0))
-        w += body_mobility(m, wp.vec3(0.0, 1.0, 0.0)) + body_mobility(m, wp.vec3(0.0, 0.0, 1.0))
-        force = -row.stiffness * (apart - give) - wp.min(row.damping, largest_damping(w, dt)) * v
+        force = attachment_force(row, apart, v, m, dt)
     else:
         gap = gap_of(row, apart)
-        less = wp.dot(row.normal, give)
-        if gap - less > law.adhesion:
+        if gap > law.adhesion:
             return
-        yielded = float(0.0)
-        if gap < 0.0:
-            yielded = wp.clamp(less / gap, 0.0, 1.0)
-        m.particle = inverse_mass_of(row, load, particles)
-        pull = pull_of(row, dt, particles, before)
-        force = contact_force(row, gap - less, yielded, v, pull, m, share_of(row, load, law.crowd), dt)
+        force = contact_force(row, gap, v, pull_of(row, dt, particles, before), m, dt)
     add_to_particles(row, force, f)
     wrench = -wp.spatial_vector(force, wp.cross(arm, force))
     if body >= 0:
         wp.atomic_add(body_f, body, wrench)
     if c < contacts and reported.shape[0] > 0:
         reported[first + c] += share * wrench
-
-
-# --- yielding --------------------------------------------------------------------------------------------------------
-
-
-@wp.func
-def spring_row(direction: wp.vec3, arm: wp.vec3):
-    """Velocity of a body's point at ``arm`` along a unit vector, as a row for the body's twist."""
-    return wp.spatial_vector(direction, wp.cross(arm, direction))
-
-
-@wp.kernel(enable_backward=False)
-def gather_springs(
-    # In
-    number: int,
-    law: ContactLaw,
-    rows: wp.array[Row],
-    load: wp.array[wp.float32],
-    q: wp.array[wp.vec3],
-    bodies: Bodies,
-    # In and out
-    curvature: wp.array[wp.spatial_matrix],
-    slope: wp.array[wp.spatial_vector],
-):
-    """Gather the data of rows for ``solve_yielding`` that hold after bodies have yielded so far; the first time, of
-    those that hold at the current positions, and the number of places where each body is touched."""
-    row = rows[wp.tid()]
-    body = row.body
-    if row.nodes[0] < 0 or body < 0:
-        return
-    if is_fixed(body, bodies):
-        return
-    point, arm = point_and_arm(row, bodies)
-    apart = sum_of(row, q) - point
-    k = row.stiffness
-    if is_attachment(row):
-        total = wp.spatial_matrix()
-        for axis in range(3):
-            direction = wp.vec3()
-            direction[axis] = 1.0
-            along = spring_row(direction, arm)
-            total += wp.outer(along, along)
-        wp.atomic_add(curvature, body, k * total)
-        wp.atomic_add(slope, body, k * spring_row(apart, arm))
-    else:
-        along = spring_row(row.normal, arm)
-        gap = gap_of(row, apart)
-        now = float(gap)
-        if number > 0:
-            now -= wp.dot(along, bodies.yielding[body])
-        if now > law.adhesion:
-            return
-        k *= row.measure * share_of(row, load, law.crowd)
-        wp.atomic_add(curvature, body, k * wp.outer(along, along))
-        wp.atomic_add(slope, body, k * gap * along)
-    if number == 0:
-        wp.atomic_add(bodies.places, body, 1)
-
-
-@wp.kernel(enable_backward=False)
-def solve_yielding(
-    # In
-    dt: float,
-    # In and out
-    bodies: Bodies,
-    curvature: wp.array[wp.spatial_matrix],
-    slope: wp.array[wp.spatial_vector],
-):
-    """Solve for d of bodies: (K + M/dt^2) d = s with V = d . K d / 2 - s . d; K and s are reset to zero.
-
-    With M^-1 = L L^T, which may be singular, and d = dt L e this is (1 + dt^2 L^T K L) e = dt L^T s.
-    """
-    b = wp.tid()
-    k = curvature[b]
-    s = slope[b]
-    curvature[b] = wp.spatial_matrix()
-    slope[b] = wp.spatial_vector()
-    if is_fixed(b, bodies):
-        bodies.yielding[b] = wp.spatial_vector()
-        return
-    turn = wp.quat_to_matrix(wp.transform_get_rotation(bodies.q[b]))
-    angular = root_columns(turn * bodies.inv_inertia[b] * wp.transpose(turn))
-    linear = wp.sqrt(bodies.inv_mass[b])
-    factor = wp.spatial_matrix()
-    for i in range(3):
-        factor[i, i] = dt * linear
-        for j in range(3):
-            factor[3 + i, 3 + j] = dt * angular[i, j]
-    a = wp.transpose(factor) * k * factor
-    e = wp.transpose(factor) * s
-    for i in range(6):
-        a[i, i] += 1.0
-    # By elimination.
-    for i in range(6):
-        for j in range(i + 1, 6):
-            share = a[j, i] / a[i, i]
-            e[j] -= share * e[i]
-            for column in range(i, 6):
-                a[j, column] -= share * a[i, column]
-    for step in range(6):
-        i = 5 - step
-        for column in range(i + 1, 6):
-            e[i] -= a[i, column] * e[column]
-        e[i] /= a[i, i]
-    bodies.yielding[b] = factor * e
 
 
 # --- soft surfaces with one another ----------------------------------------------------------------------------------
@@ -466,7 +356,6 @@ def listed_row(surfaces: Surfaces, lists: PairLists, law: ContactLaw, n: int, c:
     gap = float(1.0)
     if row.nodes[0] >= 0:
         gap = gap_of(row, sum_of(row, q))
-    row.counted = 2.0 * row.measure
     row.stiffness = law.stiffness
     row.damping = law.damping
     row.slope = law.slope
@@ -490,7 +379,7 @@ def count_pair_loads(
     for c in range(in_triangles + in_edges):
         row, gap = listed_row(surfaces, lists, law, n, c, q)
         if gap < 0.0:
-            add_load(row, load)
+            add_load(row, 2.0, load)
 
 
 @wp.kernel(enable_backward=False)
@@ -521,7 +410,5 @@ def scatter_pairs(
         if gap < 0.0:
             m = Mobility()
             m.particle = inverse_mass_of(row, load, particles)
-            share = share_of(row, load, law.crowd)
-            pull = pull_of(row, dt, particles, before)
-            force = contact_force(row, gap, 0.0, sum_of(row, qd), pull, m, share, dt)
+            force = contact_force(row, gap, sum_of(row, qd), pull_of(row, dt, particles, before), m, dt)
             add_to_particles(row, force, f)

@@ -46,7 +46,7 @@ from .particles import (
     place_of,
     trouble_of,
 )
-from .rows import ContactLaw, Row, ease_off, gap_of, is_attachment, point_and_arm, share_of, sum_of
+from .rows import ContactLaw, Row, ease_off, gap_of, is_attachment, point_and_arm, sum_of
 
 wp.set_module_options({"enable_backward": False})
 
@@ -329,7 +329,6 @@ def begin_springs(
     dt: float,
     law: ContactLaw,
     rows: wp.array[Row],
-    load: wp.array[wp.float32],
     q: wp.array[wp.vec3],
     bodies: Bodies,
     particle_entry: wp.array[wp.int32],
@@ -358,10 +357,8 @@ def begin_springs(
             slide = wp.transform_vector(bodies.q[row.body], slide)
             springs.lever[c] = -wp.skew(arm) * roots[row.body]
         apart = sum_of(row, q) - point
-        stiffness = float(row.stiffness)
         if not is_attachment(row):
             apart = wp.vec3(gap_of(row, apart), 0.0, 0.0)
-            stiffness *= share_of(row, load, law.crowd)
         springs.weights[c] = row.weights
         springs.body[c] = entry
         springs.arm[c] = arm
@@ -369,7 +366,7 @@ def begin_springs(
         springs.gap[c] = apart
         springs.slide[c] = slide
         springs.most[c] = 0.0
-        law4 = wp.vec4(stiffness, row.damping, row.slope, 0.0) * row.measure
+        law4 = wp.vec4(row.stiffness, row.damping, row.slope, 0.0) * row.measure
         law4[3] = row.friction
         springs.law[c] = law4
     springs.nodes[c] = entries

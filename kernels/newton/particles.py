@@ -50,8 +50,7 @@ class Bodies:
     inv_inertia: wp.array[wp.mat33]
     inertia: wp.array[wp.mat33]
     com: wp.array[wp.vec3]
-    places: wp.array[wp.int32]  # at how many places each is touched or held
-    yielding: wp.array[wp.spatial_vector]  # see ``explicit``
+    places: wp.array[wp.float32]  # at how many places each may be touched or is held
     q: wp.array[wp.transform]
     qd: wp.array[wp.spatial_vector]
 

@@ -8,10 +8,9 @@ only repeats the particle's own record; on flat ground, all do, and rounding dec
 row has a measure from 0 at the corners, and at a triangle's sides, to 1 in the middle, and its force is multiplied by
 that.
 
-Many rows may share a particle: its load is the sum of its weights in all that touch, times their measures. Two
-bounds follow, by Jensen's inequality. Stiffness k in every row adds at most k times the load at a particle, so
-rows with a particle whose load is above ``crowd`` get only their share of crowd k; and dampers of
-1 / (dt max w_j load_j), with inverse masses w, stop nothing more than once within a step.
+Many rows may share a particle: its load is the sum of its weights in all that may act in the step, times their
+measures. By Jensen's inequality, springs and dampers that are bounded by the inverse mass max w_j load_j, with inverse
+masses w, are bounded in all rows together.
 
 Newton finds contacts where things are when it is asked. A particle that had no row in the last step, and is deep in a
 shape now, has been found late: its whole spring would throw it out. So it begins to push where it is, and is let out at
@@ -53,7 +52,6 @@ class ContactLaw:
     slope: float  # of friction [N s/m]
     friction: float
     adhesion: float  # distance up to which a particle adheres [m]
-    crowd: float  # maximum stiffness of all contacts at a particle over that of one
     recovery: float  # speed at which what was found too late is pushed out [m/s]
 
 
@@ -64,7 +62,6 @@ class Row:
     nodes: wp.vec4i  # particles, -1 where there is none; there is no row if the first is -1
     weights: wp.vec4
     measure: float
-    counted: float  # how often it counts in loads
     body: int  # -1: there is none
     point: wp.vec3  # in the body's frame [m]
     velocity: wp.vec3  # of the surface of the body's shape there, in its frame [m/s]
@@ -125,24 +122,6 @@ def ease_off(c: int, dt: float, law: ContactLaw, rows: wp.array[Row]):
 
 
 @wp.func
-def load_of(i: int, load: wp.array[wp.float32]):
-    """The load of a particle; 1 where loads are not counted, because every row has a particle of its own."""
-    if load.shape[0] == 0:
-        return 1.0
-    return load[i]
-
-
-@wp.func
-def share_of(row: Row, load: wp.array[wp.float32], crowd: float):
-    """The share of its stiffness that a contact has."""
-    largest = float(1.0)
-    for k in range(4):
-        if row.nodes[k] >= 0 and row.weights[k] != 0.0:
-            largest = wp.max(largest, load_of(row.nodes[k], load))
-    return wp.min(1.0, crowd / largest)
-
-
-@wp.func
 def inverse_mass_of(row: Row, load: wp.array[wp.float32], particles: Particles):
     """Inverse mass of a contact's point, for one of the contacts that share its particles [1/kg]."""
     largest = float(0.0)
@@ -150,7 +129,7 @@ def inverse_mass_of(row: Row, load: wp.array[wp.float32], particles: Particles):
         i = row.nodes[k]
         if i >= 0 and row.weights[k] != 0.0:  # noqa: SIM102 - the next value exists only then
             if is_moved(i, particles):
-                largest = wp.max(largest, particles.inv_mass[i] * load_of(i, load))
+                largest = wp.max(largest, particles.inv_mass[i] * load[i])
     return largest
 
 
@@ -175,29 +154,11 @@ def add_to_particles(row: Row, force: wp.vec3, f: wp.array[wp.vec4]):
 
 
 @wp.func
-def add_load(row: Row, load: wp.array[wp.float32]):
+def add_load(row: Row, times: float, load: wp.array[wp.float32]):
     for k in range(4):
-        weight = row.counted * wp.abs(row.weights[k])
+        weight = times * row.measure * wp.abs(row.weights[k])
         if row.nodes[k] >= 0 and weight > 0.0:
             wp.atomic_add(load, row.nodes[k], weight)
-
-
-@wp.kernel(enable_backward=False)
-def count_loads(
-    # In
-    adhesion: float,
-    rows: wp.array[Row],
-    bodies: Bodies,
-    q: wp.array[wp.vec3],
-    # In and out
-    load: wp.array[wp.float32],
-):
-    """Add the weights of all contacts that touch at the bodies' current positions."""
-    row = rows[wp.tid()]
-    if row.nodes[0] >= 0 and row.counted > 0.0:
-        point, _arm = point_and_arm(row, bodies)
-        if gap_of(row, sum_of(row, q) - point) <= adhesion:
-            add_load(row, load)
 
 
 # --- records of Newton's collision pipeline, and attachments ----------------------------------------------------------
@@ -379,6 +340,8 @@ def fill_rows(
     before: wp.array[wp.float32],
     # Out
     after: wp.array[wp.float32],
+    load: wp.array[wp.float32],
+    places: wp.array[wp.float32],
     rows: wp.array[Row],
     trouble: wp.array[wp.int32],
 ):
@@ -388,6 +351,7 @@ def fill_rows(
     Args:
         eased: How far contacts that were found late have been let out in the last step [m].
         before, after: What particles had in the last step and have in this one; see ``worlds.NO_ROW``.
+        load, places: In how many rows particles and bodies are, zero before.
     """
     c = wp.tid()
     row = no_row()
@@ -401,6 +365,8 @@ def fill_rows(
             row.point = attachments.body_point[a]
             row.stiffness = attachments.stiffness[a]
             row.damping = attachments.damping[a]
+            wp.atomic_add(load, row.nodes[0], 1.0)
+            wp.atomic_add(places, row.body, 1.0)
         rows[c] = row
         return
     if c == 0 and records.count[0] > contacts:
@@ -415,8 +381,10 @@ def fill_rows(
             is_one = counts(c, in_frame_of_body(sum_of(found, q), body, body_q), records, shapes)
         if is_one:
             row = found
-            row.counted = row.measure
             row.body = body
+            add_load(row, 1.0, load)
+            if body >= 0:
+                wp.atomic_add(places, body, row.measure)
             row.point = records.body_pos[c]
             row.velocity = records.body_vel[c]
             row.normal = records.normal[c]

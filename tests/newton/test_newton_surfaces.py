@@ -154,28 +154,6 @@ def test_wrenches_of_a_shape_are_what_its_body_feels(device):
         solver.shape_wrenches(contacts, None)
 
 
-def test_their_stiffness_counts_in_the_stable_step(device):
-    model = ball_on_block(device)
-    contact_parameters(model, ke=1e6)
-    solver = wn.SolverCorotated(model)
-    alone = solver.contact_dt
-    pipeline = newton.CollisionPipeline(model, **FULL)
-    contacts, before, after = pipeline.contacts(), model.state(), model.state()
-    pipeline.collide(before, contacts)
-    solver.step(before, after, None, contacts, 1e-5)
-    assert 0.4 * alone < solver.contact_dt < 0.75 * alone
-
-
-def test_a_recording_needs_a_step_before(device):
-    model = ball_on_block(device)
-    solver = wn.SolverCorotated(model)
-    pipeline = newton.CollisionPipeline(model, **FULL)
-    contacts, before, after = pipeline.contacts(), model.state(), model.state()
-    pipeline.collide(before, contacts)
-    with pytest.raises(wc.InputError, match="make one step"), wp.ScopedCapture(device=device):
-        solver.step(before, after, None, contacts, 1e-4)
-
-
 @pytest.mark.slow
 def test_a_plate_of_triangles_carries_a_block(device):
     """The nodes of a flat face carry it, as without full-surface contacts; records across the plate do not push it

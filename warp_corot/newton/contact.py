@@ -27,10 +27,6 @@ from .library import newton
 KINEMATIC = int(newton.BodyFlags.KINEMATIC)
 #: Sine of an angle below which two edges are parallel, as in Newton's detector.
 PARALLEL = 1e-5
-#: Number of iterations that find which contacts still hold after bodies have yielded.
-ROUNDS = 4
-#: The stiffness of all contacts that share a particle is at most this many times the stiffness of one.
-CROWD = 4.0
 #: The most states whose bodies are remembered.
 STATES = 8
 #: Speed at which what was found too late is pushed out [m/s].
@@ -49,7 +45,6 @@ class Contacts:
         contact_count, count: Number of contacts, and of all rows.
         law: The law of contact of a step.
         reactions: Wrenches of the particles on the bodies in the last substep [N, N m], spatial_vector [B].
-        crowded: Whether contacts of edges and triangles have occurred.
     """
 
     def __init__(self, model: newton.Model, margin: float | None = None):
@@ -59,18 +54,15 @@ class Contacts:
         self.rows = wp.zeros(0, dtype=rows.Row, device=self.device)
         self.contact_count = self.count = 0
         self._lists: explicit.PairLists | None = None
-        #: Loads of particles; not needed if every contact has a particle of its own.
-        self._no_load = wp.empty(0, dtype=wp.float32, device=self.device)
-        self._load = self._no_load
+        #: In how many rows particles and bodies may be in a step; and the same of particles with the pairs that touch.
+        self._load = wp.zeros(model.particle_count, dtype=wp.float32, device=self.device)
+        self._loads = self._load if self.pairs is None else wp.zeros_like(self._load)
+        self._places = wp.zeros(bodies, dtype=wp.float32, device=self.device)
         #: Forces on particles before contact forces [N], which friction uses.
         self._before = wp.empty(model.particle_count, dtype=wp.vec4, device=self.device)
+        self._nothing = wp.empty(0, dtype=wp.float32, device=self.device)
         self._no_wrenches = wp.empty(0, dtype=wp.spatial_vectorf, device=self.device)
-        self._places = wp.zeros(bodies, dtype=wp.int32, device=self.device)
-        #: Curvature and slope of springs on bodies, and how far these yield to them [m]; and twists, [B].
-        self._curvature = wp.zeros(bodies, dtype=wp.spatial_matrixf, device=self.device)
-        self._slope, self._yielding, self.reactions = (
-            wp.zeros(bodies, dtype=wp.spatial_vectorf, device=self.device) for _ in range(3)
-        )
+        self.reactions = wp.zeros(bodies, dtype=wp.spatial_vectorf, device=self.device)
         self._bodies: dict[tuple, Bodies] = {}
         self._particles, self._shapes = _Given(Particles, "particle_", model), _Given(rows.Shapes, "shape_", model)
         self._attachments = _Given(rows.Attachments, "attachment_particle_body_", model)
@@ -85,7 +77,6 @@ class Contacts:
         )
         self._last_dt = 0.0
         self.forget()
-        self.crowded = False
         self.refresh()
 
     def forget(self) -> None:
@@ -93,42 +84,17 @@ class Contacts:
         self._before_step.fill_(float(UNKNOWN_BEFORE))
         self._in_step.fill_(float(NO_ROW))
 
-    def has_surfaces(self, contacts: newton.Contacts) -> bool:
-        """Whether contacts may be of edges and triangles while their stiffness is not counted yet."""
-        if self.crowded or not self._can_touch(contacts):
-            return False
-        # This attribute is private to Newton. Without it, every model with triangles may have such records.
-        return bool(getattr(contacts, "_enable_rigid_soft_full_surface_contact", self.model.tri_count > 0))
-
     def refresh(self) -> None:
-        """Check that attachments can be stepped, and find the stiffness of attachments and contacts.
+        """Check that attachments can be stepped.
 
         Raises:
             InputError: An attachment is rigid.
         """
-        model = self.model
-        found, touched = [0.0], np.zeros(model.body_count, bool)
-        if model.shape_count:
-            one = 0.5 * (model.soft_contact_ke + float(model.shape_material_ke.numpy().max()))
-            found.append(one * (CROWD if self.crowded else 1.0))
-            collide = (model.shape_flags.numpy() & int(newton.ShapeFlags.COLLIDE_PARTICLES)) != 0
-            bodies = model.shape_body.numpy()
-            touched[bodies[collide & (bodies >= 0)]] = True
-        if self.pairs is not None:
-            found.append(CROWD * model.soft_contact_ke)
-        if model.attachment_particle_body_count:
-            stiffness = model.attachment_particle_body_stiffness.numpy()
+        if self.model.attachment_particle_body_count:
+            stiffness = self.model.attachment_particle_body_stiffness.numpy()
             bad = np.flatnonzero(~np.isfinite(stiffness))
             if len(bad):
                 raise InputError(f"attachment {bad[0]} has stiffness {stiffness[bad[0]]}; it must be finite [N/m]")
-            found.append(float(stiffness.max()))
-            touched[model.attachment_particle_body_body.numpy()] = True
-        #: Largest possible stiffness of a contact or an attachment [N/m]; and inverse mass of the lightest moving body
-        #: that particles can touch or are attached to [1/kg], 0: there is none.
-        self.stiffest, self.lightest = max(found), 0.0
-        if model.body_count:
-            touched &= (model.body_flags.numpy() & KINEMATIC) == 0
-            self.lightest = float(model.body_inv_mass.numpy()[touched].max(initial=0.0))
 
     # --- launches ----------------------------------------------------------------------------------------------------
 
@@ -149,6 +115,8 @@ class Contacts:
         eased, self._last_dt = RECOVERY * self._last_dt, step.dt if self.contact_count else 0.0
         if self.count or self._lists is not None:
             self._take_law()
+            self._load.zero_()
+            self._places.zero_()
         if not self.count:
             return
         if len(self.rows) != self.count:
@@ -156,7 +124,7 @@ class Contacts:
         those = self._records_of(found, step) if found is not None and touches else self._no_records
         inputs = [self.contact_count, self.law, those, self._shapes.of(model), self._attachments.of(model)]
         inputs += [model.particle_flags, model.particle_radius, state.particle_q, state.body_q]
-        inputs += [eased, self._before_step, self._in_step]
+        inputs += [eased, self._before_step, self._in_step, self._load, self._places]
         self._launch(rows.fill_rows, self.count, inputs, [self.rows, trouble])
 
     @property
@@ -167,7 +135,7 @@ class Contacts:
     @property
     def memory(self) -> list[wp.array]:
         """What particles had in the last step and have in this one; empty without contacts."""
-        return [self._before_step, self._in_step] if self.contact_count else [self._no_load, self._no_load]
+        return [self._before_step, self._in_step] if self.contact_count else [self._nothing, self._nothing]
 
     def add_forces(
         self, substep: Step, of_bodies: newton.State, f: wp.array, trouble: wp.array, share: float = 1.0
@@ -185,35 +153,26 @@ class Contacts:
         model, state, dt, reported = self.model, substep.state_in, substep.dt, substep.reported
         if self.contact_count or self._lists is not None:
             wp.copy(self._before, f)
-        load, bodies, particles = self.count_loads(state, of_bodies), self.bodies(of_bodies), self.particles
+        bodies, particles = self.bodies(of_bodies), self.particles
         motion = [state.particle_q, state.particle_qd, self._before]
         if model.body_count:
             self.reactions.zero_()
+        surfaces = []
+        if self._lists is not None and self.pairs is not None:
+            surfaces = [self.pairs.surfaces, self._lists, self.law]
+            wp.copy(self._loads, self._load)
+            inputs = [*surfaces, state.particle_q]
+            self._launch(explicit.count_pair_loads, self.pairs.size, inputs, [self._loads])
+        load = self._loads if surfaces else self._load
         if self.count:
-            if model.body_count:
-                self._find_yielding(state, bodies, load, dt)
             first = substep.contacts.rigid_contact_max if substep.contacts is not None else 0
             inputs = [dt, share, self.law, self.contact_count, first, self.rows, load, particles, bodies, *motion]
             outputs = [f, self.reactions, self._no_wrenches if reported is None else reported]
             self._launch(explicit.scatter_rows, self.count, inputs, outputs)
-        if self._lists is not None and self.pairs is not None:
-            inputs = [self.pairs.surfaces, self._lists, self.law, dt, load, particles, *motion]
-            self._launch(explicit.scatter_pairs, self.pairs.size, inputs, [f, trouble])
-
-    def count_loads(self, state: newton.State, of_bodies: newton.State) -> wp.array:
-        """Launch the count of how many contacts share each particle, if several may: float32 [P], or empty."""
-        if not ((self.contact_count and self.crowded) or self._lists is not None):
-            return self._no_load
-        if not len(self._load):
-            self._load = wp.empty(self.model.particle_count, dtype=wp.float32, device=self.device)
-        self._load.zero_()
-        if self.contact_count:
-            inputs = [self.law.adhesion, self.rows, self.bodies(of_bodies), state.particle_q]
-            self._launch(rows.count_loads, self.contact_count, inputs, [self._load])
-        if self._lists is not None and self.pairs is not None:
-            inputs = [self.pairs.surfaces, self._lists, self.law, state.particle_q]
-            self._launch(explicit.count_pair_loads, self.pairs.size, inputs, [self._load])
-        return self._load
+        if surfaces and self.pairs is not None:
+            self._launch(
+                explicit.scatter_pairs, self.pairs.size, [*surfaces, dt, load, particles, *motion], [f, trouble]
+            )
 
     def bodies(self, of_bodies: newton.State) -> Bodies:
         """Bodies in a state; made once for each of the states that take turns."""
@@ -224,20 +183,11 @@ class Contacts:
             self._bodies[arrays] = self._made_bodies(*arrays)
         return self._bodies[arrays]
 
-    def _find_yielding(self, state: newton.State, bodies: Bodies, load: wp.array, dt: float) -> None:
-        """Find how far bodies yield to springs, and at how many places they are touched."""
-        self._places.zero_()
-        for number in range(ROUNDS if self.contact_count else 1):
-            inputs = [number, self.law, self.rows, load, state.particle_q, bodies]
-            self._launch(explicit.gather_springs, self.count, inputs, [self._curvature, self._slope])
-            inputs = [dt, bodies, self._curvature, self._slope]
-            self._launch(explicit.solve_yielding, self.model.body_count, inputs, [])
-
     def _take_law(self) -> None:
         """Take the model's present values."""
         model = self.model
         values = [model.soft_contact_ke, model.soft_contact_kd, model.soft_contact_kf, model.soft_contact_mu]
-        values += [model.particle_adhesion, CROWD, RECOVERY]
+        values += [model.particle_adhesion, RECOVERY]
         if values != self._law_values:
             self._law_values, self.law = values, rows.ContactLaw()
             names: Any = rows.ContactLaw
@@ -270,7 +220,7 @@ class Contacts:
 
     def _made_bodies(self, q: wp.array | None, qd: wp.array | None) -> Bodies:
         made = self._of_bodies.new(self.model)
-        made.fixed_flag, made.places, made.yielding = KINEMATIC, self._places, self._yielding
+        made.fixed_flag, made.places = KINEMATIC, self._places
         if self.model.body_count:
             made.q, made.qd = q, qd
         return made

@@ -167,7 +167,7 @@ class RowForces:
         self._law = [step.dt, contacts.law.adhesion]
         if is_new:
             self._make_room()
-        inputs = [step.dt, contacts.law, contacts.rows, contacts.count_loads(state, of_bodies), state.particle_q]
+        inputs = [step.dt, contacts.law, contacts.rows, state.particle_q]
         inputs += [contacts.bodies(of_bodies), self._unknowns.particle, self._unknowns.body, self._unknowns.roots]
         self._launch(kernels.begin_springs, inputs, [self._rows])
         return is_new

@@ -94,9 +94,9 @@ class SolverCorotated(SolverBase, CouplingInterface):
 
     Attributes:
         stable_dt: The largest stable step about rest [s], of tetrahedra, springs, triangles (cloth) and bending edges
-                with their damping. It excludes joints, and so do ``contact_dt`` and ``substeps=None``.
-        contact_dt: The same with a contact or an attachment at every particle [s], with the largest stiffness here and
-            the lightest rigid body at its other end; with ``particle_contact``, also contacts with other particles.
+                with their damping. It excludes joints, and so do ``contact_dt`` and ``substeps=None``. Contacts with
+                shapes and attachments of any stiffness need no shorter steps.
+        contact_dt: The same [s]; with ``particle_contact``, with contacts between particles.
 
     Raises:
         InputError: No tetrahedra, a material that is not positive definite, or an option out of its range.
@@ -237,8 +237,7 @@ class SolverCorotated(SolverBase, CouplingInterface):
         Raises:
             InputError: A time step that is not stable, arrays on another device, or states without attributes that the
                 solver needs; then nothing was launched. On the CPU, except in a capture, also: a state that is not
-                finite, or more contacts than the buffer holds; as in ``check``. In a recording: contacts of edges
-                and triangles that no step before had.
+                finite, or more contacts than the buffer holds; as in ``check``.
             UnstableError: On the CPU, except in a capture: the step's result is not finite.
         """
         refuse_tape()
@@ -247,7 +246,6 @@ class SolverCorotated(SolverBase, CouplingInterface):
         step, following = Step(state_in, state_out, control, contacts, dt, reported), self._following
         check_step(step, self.model)
         self._steps.report.check_earlier(following)
-        self._see_surfaces(contacts)
         count = self._count_for(dt)
         self._steps.launch(step, count, following)
         self._recordings.follow(state_in, state_out)
@@ -309,10 +307,9 @@ class SolverCorotated(SolverBase, CouplingInterface):
     def notify_model_changed(self, flags: int) -> None:
         """Read changes of the model; stable steps are found again if they may have changed.
 
-        ``ModelFlags.MODEL_PROPERTIES`` stands for changed materials of elements or masses; ``SHAPE_PROPERTIES`` and
-        ``CONSTRAINT_PROPERTIES`` for changed stiffness of contacts and attachments. Every step reads gravity,
-        activations and forces of contact from the model. This waits for the device, except in a capture, in which
-        materials are not updated.
+        ``ModelFlags.MODEL_PROPERTIES`` stands for changed materials of elements or masses, ``CONSTRAINT_PROPERTIES``
+        for changed stiffness of attachments. Every step reads gravity, activations and forces of contact from the
+        model. This waits for the device, except in a capture, in which materials are not updated.
 
         Raises:
             InputError: As in the constructor.
@@ -322,14 +319,11 @@ class SolverCorotated(SolverBase, CouplingInterface):
         if self.device.is_capturing:
             return
         bits = newton.ModelFlags
-        before, elements = (self._contacts.stiffest, self._contacts.lightest), bool(flags & bits.MODEL_PROPERTIES)
-        if elements and (elements := self._has_changed()):
+        if flags & (bits.CONSTRAINT_PROPERTIES | bits.MODEL_PROPERTIES):
+            self._contacts.refresh()
+        if flags & bits.MODEL_PROPERTIES and self._has_changed():
             self.tetrahedra.refresh()
             self._others.refresh()
-        of_contacts = bits.SHAPE_PROPERTIES | bits.CONSTRAINT_PROPERTIES | bits.MODEL_PROPERTIES
-        if flags & (of_contacts | bits.BODY_PROPERTIES | bits.BODY_INERTIAL_PROPERTIES):
-            self._contacts.refresh()
-        if elements or (self._contacts.stiffest, self._contacts.lightest) != before:
             self._find_stable_steps()
 
     @classmethod
@@ -355,24 +349,11 @@ class SolverCorotated(SolverBase, CouplingInterface):
     def _find_stable_steps(self) -> None:
         given = self._given_stable_dt
         if given is None:
-            self.stable_dt, self.contact_dt = stable_steps(self.tetrahedra, self._others, self._contacts)
+            self.stable_dt, self.contact_dt = stable_steps(self.tetrahedra, self._others)
         else:
             self.stable_dt = self.contact_dt = float(given)
         if self._following is not None:
             self._following.find_rest(self.contact_dt)
-
-    def _see_surfaces(self, contacts: newton.Contacts | None) -> None:
-        """Count the stiffness of contacts of edges and triangles in the stable step from the first time on."""
-        if contacts is None or not self._contacts.has_surfaces(contacts):
-            return
-        if self.device.is_capturing:
-            raise InputError(
-                "contacts hold contacts of edges and triangles for the first time, and a step that is being recorded "
-                "cannot find the substeps for them: make one step with these contacts before the recording"
-            )
-        self._contacts.crowded = True
-        self._contacts.refresh()
-        self._find_stable_steps()
 
     def _count_for(self, dt: float) -> int:
         dt = checked_dt(dt)

@@ -19,7 +19,6 @@ from warp_corot.mesh.topology import linked, node_pairs
 from warp_corot.solvers.pace import Mapped
 from warp_corot.solvers.stability import Curvature, largest_eigenvalue
 
-from .contact import Contacts
 from .library import newton
 from .others import Others
 from .tetrahedra import Tetrahedra
@@ -34,6 +33,9 @@ RETRIES = 4
 RECOVERY = 1.02
 #: Fraction of the largest stable step that errors suggest: elements stiffen when strained.
 SAFETY = 0.7
+#: The way of a particle that may meet something in a substep, over the size of the smallest element: contact is no
+#: stiffer than elements, so that a body that falls as fast as waves travel in it would sink in as far as it does.
+STRIDE = 0.5
 #: Number of attempts to lengthen a step, and the largest eigenvalue, of 4, from which it is long enough.
 LENGTHENINGS = 6
 ENOUGH = 3.95
@@ -62,9 +64,7 @@ class _SmallMotions:
         return nullcontext()
 
 
-def stable_step(
-    tets: Tetrahedra, others: Others, stiffness: float = 0.0, damping: float = 0.0, of_bodies: float = 0.0
-) -> float:
+def stable_step(tets: Tetrahedra, others: Others, stiffness: float = 0.0, damping: float = 0.0) -> float:
     """The largest stable step of symplectic Euler about rest [s]; infinite if nothing can move.
 
     It is stable while no eigenvalue of dt^2 M^-1 K + 2 dt M^-1 C is above 4. With w^2 the largest eigenvalue of M^-1 K
@@ -74,10 +74,8 @@ def stable_step(
 
     Args:
         tets, others: The parts of the model.
-        stiffness: Stiffness of a spring at every particle [N/m], for contact.
+        stiffness: Stiffness of a spring at every particle [N/m], for contact with other particles.
         damping: Damping of a damper at every particle [N s/m].
-        of_bodies: Stiffness over mass at the other end of this spring [1/s^2]; 0: that end does not move. Bodies that
-            are touched in several places need no shorter steps; see ``kernels.newton.explicit``.
     """
     inverse = free_inverse_masses(tets.model)
     inverse_mass = wp.array(inverse, dtype=wp.float32, device=tets.device)
@@ -85,7 +83,7 @@ def stable_step(
 
     def largest(a: float, b: float) -> float:
         motions = _SmallMotions(tets, others, a, b, stiffness, damping)
-        return largest_eigenvalue(motions, inverse_mass, smallest, len(inverse)) + a * of_bodies
+        return largest_eigenvalue(motions, inverse_mass, smallest, len(inverse))
 
     w2 = largest(1.0, 0.0)
     if not (tets.damped or others.damped or damping > 0):
@@ -109,14 +107,10 @@ def free_inverse_masses(model: newton.Model) -> npt.NDArray[np.floating]:
     return np.where(active, model.particle_inv_mass.numpy(), 0.0)
 
 
-def stable_steps(tets: Tetrahedra, others: Others, contacts: Contacts) -> tuple[float, float]:
-    """The largest stable step about rest [s], and the same with a contact or an attachment at every particle."""
+def stable_steps(tets: Tetrahedra, others: Others) -> tuple[float, float]:
+    """The largest stable step about rest [s], and the same with contacts of each particle with others."""
     alone = stable_step(tets, others)
-    stiffness, damping = others.contact
-    stiffness += contacts.stiffest
-    if not (stiffness > 0 or damping > 0):
-        return alone, alone
-    return alone, min(alone, stable_step(tets, others, stiffness, damping, contacts.stiffest * contacts.lightest))
+    return alone, min(alone, stable_step(tets, others, *others.contact)) if any(others.contact) else alone
 
 
 def check_substep(dt: float, count: int, stable_dt: float, contact_dt: float) -> None:
@@ -155,7 +149,7 @@ class Following:
         self.model, self.tetrahedra = model, tetrahedra
         self.device = model.device
         self._f = wp.zeros(model.particle_count, dtype=wp.vec4, device=self.device)
-        self._found = wp.zeros((1, 2), dtype=wp.float32, device=self.device)
+        self._found = wp.zeros((1, 3), dtype=wp.float32, device=self.device)
         self._curvature = Curvature(model.particle_count, self._found[0])
         self._at_rest = wp.zeros((1, 4), dtype=wp.float64, device=self.device)
         self._allowed = wp.zeros(1, dtype=wp.float64, device=self.device)
@@ -179,6 +173,10 @@ class Following:
         curvature = self._curvature.at_rest(tets.add_linear_forces, self._inverse_mass, len(inverse))
         row = [stable, curvature, Corotated.step_safety, Corotated.strained_safety]
         self._longest = stable * Corotated.step_safety
+        self._stride, self._falls = 0.0, INTERVAL * float(np.linalg.norm(self.model.gravity.numpy(), axis=1).max())
+        if self.model.shape_count:
+            self._stride = STRIDE * float(tets.elements.volume.numpy().min()) ** (1 / 3)
+            self._longest = min(self._longest, math.sqrt(self._stride / max(self._falls, 1e-30)))
         if not math.isfinite(stable):
             row[0] = self._longest = 1e30
         self._at_rest.assign(np.array([row]))
@@ -227,7 +225,7 @@ class Following:
         looked_at = -(-model.tet_count // int(stability.TURNS))
         self._launch(of_elements.find_posed_strains, inputs, [self._found], looked_at)
         recorded = substep if self.device.is_capturing else 0.0
-        inputs = [self._at_rest, wp.float64(recorded)]
+        inputs = [self._at_rest, wp.float64(recorded), self._stride, self._falls]
         outputs = [self._found, self._allowed, self._turn, self._excess, self._seen.array]
         self._launch(of_elements.take_safe_substep, inputs, outputs, 1)
         self.recover()
