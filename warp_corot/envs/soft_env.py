@@ -33,7 +33,7 @@ from warp_corot.simulation.simulation import Simulation
 from warp_corot.solvers import BackwardEuler, Integrator, SymplecticEuler
 from warp_corot.solvers.recorded import Segment
 
-from .task import Scene, Task
+from .task import Actions, Scene, Task
 
 #: Actions, observations, rewards and flags as arrays of these.
 ARRAYS = ("numpy", "torch", "warp")
@@ -146,7 +146,7 @@ class SoftEnv(VectorEnv):
         """What the task is made of."""
 
     @abstractmethod
-    def scripted_actions(self, observations: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+    def scripted_actions(self, observations: Actions) -> Actions:
         """Actions of a policy by hand, which succeeds: float32 [n, A] for observations float32 [n, K]."""
 
     def launch_actions(self) -> None:
@@ -219,6 +219,14 @@ class SoftEnv(VectorEnv):
 
         return tuple(draw_world(self, world) for world in range(min(self.num_envs, 4)))
 
+    def seen(self, observations: Actions, *names: str) -> list[Actions]:
+        """Named parts of observations, [n, ...] each."""
+        return [observations[:, self.columns[name]] for name in names]
+
+    def toward(self, way: npt.NDArray[np.floating], gain: float = 1.0) -> Actions:
+        """Velocities, within [-1, 1], that go a share of a way [m] in a step."""
+        return np.clip(way * (gain * RATE / self.task.speed), -1.0, 1.0).astype(np.float32)
+
     @property
     def drawn(self) -> dict[str, npt.NDArray[np.float32]]:
         """The drawn numbers of the present episodes, float32 [worlds] each; waits for the device."""
@@ -277,7 +285,7 @@ class SoftEnv(VectorEnv):
             integrator=steps,
             gravity=(0.0, 0.0, -9.81),
             obstacles=[*scene.tools, *scene.obstacles],
-            contact=Contact(friction=scene.friction),
+            contact=Contact(friction=scene.friction, self_contact=scene.parts is not None),
             deterministic=self._is_deterministic,
         )
         assert sim.contact is not None
@@ -295,6 +303,8 @@ class SoftEnv(VectorEnv):
         kinds: dict[str, Any] = {name: wp.float32 for name in ("peak", "reward", "young", "ratio", *shapes)}
         kinds |= dict.fromkeys(("seed", "number", "step", "streak", "over", "again", "lost", "closed"), wp.int32)
         kinds |= dict.fromkeys(("terminated", "truncated", "success"), wp.bool)
+        parts = np.zeros(len(scene.mesh.points), np.int32) if scene.parts is None else scene.parts
+        shapes["pose"] = (int(parts.max()) + 1, count)
         kinds |= {"pose": wp.transform, "lump": wp.vec4, "targets": wp.transform}
         shapes["targets"] = (len(scene.tools), count)
         for name, kind in kinds.items():
@@ -306,7 +316,7 @@ class SoftEnv(VectorEnv):
         bounds = np.array(list(self.ranges.values()), np.float32).T
         self._low, self._high = (wp.array(each, dtype=wp.float32, device=device) for each in bounds)
         self._centroids = wp.array(centroids(scene.mesh), dtype=wp.vec3, device=device)
-        self._points = wp.array(scene.points, dtype=wp.int32, device=device)
+        self._points, self._parts = (wp.array(each, dtype=wp.int32, device=device) for each in (scene.points, parts))
         self._stress = wp.zeros(self.sim.body.element_count, dtype=wp.float32, device=device)
         for k, tool in enumerate(scene.tools):
             tool.use_poses(worlds.targets[k])
@@ -374,8 +384,8 @@ class SoftEnv(VectorEnv):
         self._launch(self.task.begin, self.num_envs, [chosen, *self.task.begun, worlds])
         sim.reset(chosen)
         state, discretization = body.state, body.discretization
-        inputs = [chosen, body.world_node_count, worlds.pose, state.rest, state.displacements, state.positions]
-        self._launch(kernels.place_nodes, body.node_count, inputs)
+        inputs = [chosen, body.world_node_count, self._parts, worlds.pose, state.rest]
+        self._launch(kernels.place_nodes, body.node_count, [*inputs, state.displacements, state.positions])
         inputs = [chosen, self._centroids, POISSON, worlds, discretization.mu, discretization.lam]
         self._launch(kernels.write_stiffness, body.element_count, [*inputs, *discretization.lame[:2]])
         inputs = [chosen, worlds.targets, self._contact.obstacles.motions]
