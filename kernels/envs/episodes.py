@@ -7,7 +7,7 @@ world's seed and the episode's number, so a world's episodes do not depend on ot
 
 import warp as wp
 
-from warp_corot.kernels.contact.motion import Motions
+from warp_corot.kernels.contact.motion import Motions, distance_between
 from warp_corot.kernels.elements.elements import load_node, store_node
 
 wp.set_module_options({"enable_backward": False})
@@ -200,8 +200,7 @@ def steer_fingers(far: float, low: wp.vec3, high: wp.vec3, narrow: float, wide: 
 def pace_tools(seconds: float, targets: wp.array2d[wp.transform], motions: Motions):
     """Let tools go to their targets at a speed with which they arrive after a time [s], so that they do not jerk."""
     o, w = wp.tid()
-    far = wp.transform_get_translation(targets[o, w]) - wp.transform_get_translation(motions.later[w, o])
-    motions.speed[w, o] = wp.length(far) / seconds
+    motions.speed[w, o] = distance_between(motions.later[w, o], targets[o, w], motions.reach[o]) / seconds
 
 
 # --- what is seen --------------------------------------------------------------------------------------------------

@@ -10,15 +10,17 @@ from functools import partial
 from gymnasium import register
 
 from .blocks import Lift, Stack
+from .franka import FrankaLift
 from .single import SingleEnv
 from .soft_env import SoftEnv
 from .task import Scene, Task
 from .tissue import Palpate, Reach, Retract, Thread
 
-__all__ = ["TASKS", "Lift", "Palpate", "Reach", "Retract", "Scene", "SingleEnv", "SoftEnv", "Stack", "Task", "Thread"]
+__all__ = ["TASKS", "FrankaLift", "Lift", "Palpate", "Reach", "Retract", "Scene", "SingleEnv", "SoftEnv", "Stack"]
+__all__ += ["Task", "Thread"]
 
 #: The environments by their names in gymnasium.
-TASKS = {f"warp_corot/{kind.__name__}-v0": kind for kind in (Retract, Palpate, Reach, Lift, Thread, Stack)}
+TASKS = {f"warp_corot/{kind.__name__}-v0": kind for kind in (Retract, Palpate, Reach, Lift, Thread, Stack, FrankaLift)}
 
 for _name, _kind in TASKS.items():
     register(_name, entry_point=partial(SingleEnv, _kind), vector_entry_point=_kind)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from typing import Any, ClassVar
 
@@ -23,6 +23,7 @@ from warp_corot.contact.contacts import Contacts
 from warp_corot.contact.grasp import Grasp
 from warp_corot.contact.obstacles import LARGEST_SHARE
 from warp_corot.contact.options import Contact
+from warp_corot.contact.shapes import Shape
 from warp_corot.discretization.discretization import centroids
 from warp_corot.elasticity import Corotated
 from warp_corot.errors import InputError, UnstableError
@@ -94,6 +95,8 @@ class SoftEnv(VectorEnv):
         "autoreset_mode": AutoresetMode.NEXT_STEP,
     }
     task: ClassVar[Task]
+    #: How often in a step tools are sent to new places.
+    exchanges: ClassVar[int] = 1
 
     def __init__(
         self,
@@ -152,6 +155,18 @@ class SoftEnv(VectorEnv):
     def launch_actions(self) -> None:
         """Launch what actions do to the targets of tools; here they steer the first one."""
         self._launch(kernels.steer, self.num_envs, [*self._steering, self.worlds])
+
+    def launch_exchange(self) -> None:
+        """Launch what a robot that moves the tools does, ``exchanges`` times in a step; here there is none."""
+
+    def launch_places(self, chosen: wp.array) -> None:
+        """Launch the placing of tools, and of a robot that moves them, in chosen worlds, int32 [worlds]."""
+        inputs = [chosen, self.worlds.targets, self._contact.obstacles.motions]
+        self._launch(kernels.place_tools, self.worlds.targets.shape, inputs)
+
+    def decorations(self, world: int) -> Iterable[tuple[Shape, npt.NDArray[np.float64]]]:
+        """What pictures show of a world beside tissue, tools and obstacles: shapes and their poses [7]."""
+        return ()
 
     # --- as an environment -----------------------------------------------------------------------------------------
 
@@ -267,6 +282,8 @@ class SoftEnv(VectorEnv):
         if integrator == "explicit":
             _, single, law = self._simulated(1, stiffest, SymplecticEuler(damping=DAMPING))
             self.substeps = int(np.ceil(1.0 / (RATE * SAFETY * single.stable_dt)))
+        self.substeps = self.exchanges * int(np.ceil(self.substeps / self.exchanges))
+        if integrator == "explicit":
             steps = SymplecticEuler(dt=1.0 / (RATE * self.substeps), damping=DAMPING)
         euler = BackwardEuler(dt=1.0 / (RATE * self.substeps))
         self.scene, self.sim, self._contact = self._simulated(self.num_envs, stiffest, steps or euler)
@@ -361,8 +378,11 @@ class SoftEnv(VectorEnv):
         worlds, body, motions = self.worlds, self.sim.body, self._contact.obstacles.motions
         worlds.lost.zero_()
         self.launch_actions()
-        self._launch(kernels.pace_tools, worlds.targets.shape, [1.0 / RATE, worlds.targets, motions])
-        self.sim.recorded.launch(Segment(self.substeps, adopts=True, publishes=True))
+        for _ in range(self.exchanges):
+            self.launch_exchange()
+            inputs = [1.0 / (RATE * self.exchanges), worlds.targets, motions]
+            self._launch(kernels.pace_tools, worlds.targets.shape, inputs)
+            self.sim.recorded.launch(Segment(self.substeps // self.exchanges, adopts=True, publishes=True))
         inputs = [body.world_node_count, FARTHEST, body.state.displacements, worlds]
         self._launch(kernels.find_lost, body.node_count, inputs)
         if self.task.feels_stress:
@@ -388,8 +408,7 @@ class SoftEnv(VectorEnv):
         self._launch(kernels.place_nodes, body.node_count, [*inputs, state.displacements, state.positions])
         inputs = [chosen, self._centroids, POISSON, worlds, discretization.mu, discretization.lam]
         self._launch(kernels.write_stiffness, body.element_count, [*inputs, *discretization.lame[:2]])
-        inputs = [chosen, worlds.targets, self._contact.obstacles.motions]
-        self._launch(kernels.place_tools, worlds.targets.shape, inputs)
+        self.launch_places(chosen)
 
     def _launch_observation(self) -> None:
         body, obstacles = self.sim.body, self._contact.obstacles
