@@ -7,7 +7,7 @@ world's seed and the episode's number, so a world's episodes do not depend on ot
 
 import warp as wp
 
-from warp_corot.kernels.contact.motion import Motions
+from warp_corot.kernels.contact.motion import Motions, distance_between
 from warp_corot.kernels.elements.elements import load_node, store_node
 
 wp.set_module_options({"enable_backward": False})
@@ -40,7 +40,7 @@ class Worlds:
     truncated: wp.array[wp.bool]
     success: wp.array[wp.bool]
     targets: wp.array2d[wp.transform]  # poses to which tools are sent
-    pose: wp.array[wp.transform]  # of the body
+    pose: wp.array2d[wp.transform]  # of the parts of the body, [parts, W]
     young: wp.array[wp.float32]  # [Pa]
     lump: wp.array[wp.vec4]  # centre at rest and radius of a stiffer part [m]
     ratio: wp.array[wp.float32]  # its Young's modulus over that of the rest
@@ -51,10 +51,10 @@ class Worlds:
 
 
 @wp.func
-def turned(draws: wp.array2d[wp.float32], w: int, centre: wp.vec3):
+def turned(draws: wp.array2d[wp.float32], w: int, first: int, centre: wp.vec3):
     """A pose: drawn shifts along x and y [m], and a drawn turn about the vertical through a centre [rad]."""
-    q = wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), draws[w, 3])
-    shift = wp.vec3(draws[w, 1], draws[w, 2], 0.0)
+    q = wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), draws[w, first + 2])
+    shift = wp.vec3(draws[w, first], draws[w, first + 1], 0.0)
     return wp.transformation(centre + shift - wp.quat_rotate(q, centre), q)
 
 
@@ -86,7 +86,7 @@ def draw_episodes(
     worlds.closed[w] = 0
     worlds.ratio[w] = 1.0
     worlds.young[w] = worlds.draws[w, 0]
-    worlds.pose[w] = turned(worlds.draws, w, centre)
+    worlds.pose[0, w] = turned(worlds.draws, w, 1, centre)
 
 
 @wp.kernel(enable_backward=False)
@@ -94,18 +94,19 @@ def place_nodes(
     # In
     chosen: wp.array[wp.int32],
     per_world: int,
-    poses: wp.array[wp.transform],
+    parts: wp.array[wp.int32],
+    poses: wp.array2d[wp.transform],
     rest: wp.array[wp.vec4],
     # Out
     u: wp.array[wp.vec4],
     positions: wp.array[wp.vec4],
 ):
-    """Move the bodies of chosen worlds, at rest, to their poses."""
+    """Move the bodies of chosen worlds, at rest, to their poses, each of their parts to its own."""
     i = wp.tid()
     w = i / per_world
     if chosen[w] != 0:
         x = load_node(rest, i)
-        way = wp.transform_point(poses[w], x) - x
+        way = wp.transform_point(poses[parts[i % per_world], w], x) - x
         store_node(u, i, way)
         store_node(positions, i, x + way)
 
@@ -199,8 +200,7 @@ def steer_fingers(far: float, low: wp.vec3, high: wp.vec3, narrow: float, wide: 
 def pace_tools(seconds: float, targets: wp.array2d[wp.transform], motions: Motions):
     """Let tools go to their targets at a speed with which they arrive after a time [s], so that they do not jerk."""
     o, w = wp.tid()
-    far = wp.transform_get_translation(targets[o, w]) - wp.transform_get_translation(motions.later[w, o])
-    motions.speed[w, o] = wp.length(far) / seconds
+    motions.speed[w, o] = distance_between(motions.later[w, o], targets[o, w], motions.reach[o]) / seconds
 
 
 # --- what is seen --------------------------------------------------------------------------------------------------

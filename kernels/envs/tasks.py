@@ -6,7 +6,7 @@ order in which a task names them.
 
 import warp as wp
 
-from .episodes import FORCE, OF_TOOL, POSITION, Worlds, conclude, note, seen
+from .episodes import FORCE, OF_TOOL, POSITION, Worlds, conclude, note, seen, turned
 
 wp.set_module_options({"enable_backward": False})
 
@@ -30,7 +30,7 @@ def begin_retraction(chosen: wp.array[wp.int32], site: wp.vec3, worlds: Worlds):
     w = wp.tid()
     if chosen[w] == 0:
         return
-    pose = worlds.pose[w]
+    pose = worlds.pose[0, w]
     here = wp.transform_point(pose, site)
     worlds.targets[0, w] = upright(here + drawn(worlds.draws, w, 4))
     note(worlds, w, 0, wp.transform_point(pose, site + drawn(worlds.draws, w, 7)))
@@ -76,7 +76,7 @@ def judge_palpation(near: float, least: float, hold: int, bonus: float, worlds: 
         worlds.notes[w, 1] = probe[0]
         worlds.notes[w, 2] = probe[1]
     lump = worlds.lump[w]
-    off = wp.transform_point(worlds.pose[w], wp.vec3(lump[0], lump[1], lump[2])) - probe
+    off = wp.transform_point(worlds.pose[0, w], wp.vec3(lump[0], lump[1], lump[2])) - probe
     away = wp.length(wp.vec2(off[0], off[1]))
     reward = -0.1 * away / 0.02 - wp.where(force < least, 0.1, 0.0)
     conclude(worlds, w, reward, away < near and force >= least, hold, bonus, False)
@@ -93,7 +93,7 @@ def begin_reach(chosen: wp.array[wp.int32], centre: wp.vec3, start: wp.vec3, hal
     w = wp.tid()
     if chosen[w] == 0:
         return
-    pose = worlds.pose[w]
+    pose = worlds.pose[0, w]
     worlds.targets[0, w] = upright(start + drawn(worlds.draws, w, 4))
     goal = wp.transform_point(pose, centre + wp.vec3(0.0, worlds.draws[w, 7], worlds.draws[w, 8]))
     note(worlds, w, 0, goal + wp.vec3(0.0, 0.0, half))
@@ -114,33 +114,84 @@ def judge_reach(near: float, bound: float, hold: int, bonus: float, worlds: Worl
 
 # --- lift: fingers' middle x, y, z, their distance -------------------------------------------------------------------
 
+#: Force of each finger that counts as a grip [N].
+GRIP = wp.constant(0.5)
 
-@wp.kernel(enable_backward=False)
-def begin_lift(chosen: wp.array[wp.int32], worlds: Worlds):
-    """Place the fingers above the block."""
-    w = wp.tid()
-    if chosen[w] == 0:
-        return
+
+@wp.func
+def place_fingers(worlds: Worlds, w: int):
     middle = drawn(worlds.draws, w, 4)
     apart = wp.vec3(0.5 * worlds.draws[w, 7], 0.0, 0.0)
     worlds.targets[0, w] = upright(middle - apart)
     worlds.targets[1, w] = upright(middle + apart)
 
 
+@wp.func
+def middle_of(worlds: Worlds, w: int, points: int, block: int):
+    """The middle of the observed points of a block [m]."""
+    x = wp.vec3()
+    for k in range(points * block, points * (block + 1)):
+        x += seen(worlds, w, 2 * OF_TOOL + 3 * k) / float(points)
+    return x
+
+
+@wp.func
+def approach(worlds: Worlds, w: int, block: wp.vec3):
+    """A reward from -0.2 to 0: how near the fingers are to a block, and how firmly they hold it."""
+    fingers = 0.5 * (seen(worlds, w, POSITION) + seen(worlds, w, OF_TOOL + POSITION))
+    force = wp.min(-worlds.observations[w, FORCE], worlds.observations[w, OF_TOOL + FORCE])
+    near = wp.min(wp.length(fingers - block) / 0.05, 1.0)
+    return 0.1 * (wp.clamp(force / GRIP, 0.0, 1.0) - 1.0 - near)
+
+
+@wp.kernel(enable_backward=False)
+def begin_lift(chosen: wp.array[wp.int32], worlds: Worlds):
+    """Place the fingers above the block."""
+    w = wp.tid()
+    if chosen[w] != 0:
+        place_fingers(worlds, w)
+
+
 @wp.kernel(enable_backward=False)
 def judge_lift(points: int, low: float, high: float, hold: int, bonus: float, worlds: Worlds):
-    """Judge by the height of the block's middle, between ``low`` at rest and ``high`` [m], and the way of the fingers'
-    middle to it.
+    """Judge by the height of the block's middle, between ``low`` at rest and ``high`` [m], and by how the fingers hold
+    it.
     """
     w = wp.tid()
-    block = wp.vec3()
-    for k in range(points):
-        block += seen(worlds, w, 2 * OF_TOOL + 3 * k) / float(points)
-    fingers = 0.5 * (seen(worlds, w, POSITION) + seen(worlds, w, OF_TOOL + POSITION))
+    block = middle_of(worlds, w, points, 0)
     height = wp.clamp((block[2] - low) / (high - low), 0.0, 1.0)
     worlds.notes[w, 0] = height
-    reward = 0.2 * (height - 1.0) - 0.1 * wp.length(fingers - block) / 0.05
+    reward = 0.2 * (height - 1.0) + approach(worlds, w, block)
     conclude(worlds, w, reward, block[2] > high, hold, bonus, False)
+
+
+# --- stacking: as lift, and shift x, y and turn of the lower block ----------------------------------------------------
+
+
+@wp.kernel(enable_backward=False)
+def begin_stacking(chosen: wp.array[wp.int32], centre: wp.vec3, worlds: Worlds):
+    """Place the fingers above the upper block, and the lower one about its ``centre`` [m]."""
+    w = wp.tid()
+    if chosen[w] != 0:
+        place_fingers(worlds, w)
+        worlds.pose[1, w] = turned(worlds.draws, w, 8, centre)
+
+
+@wp.kernel(enable_backward=False)
+def judge_stacking(points: int, rise: float, near: float, hold: int, bonus: float, worlds: Worlds):
+    """Judge by the distance of the upper block's middle from its goal, ``rise`` [m] above that of the lower one, and by
+    how the fingers hold it; or, at its goal, whether they have let go.
+    """
+    w = wp.tid()
+    block = middle_of(worlds, w, points, 0)
+    goal = middle_of(worlds, w, points, 1) + wp.vec3(0.0, 0.0, rise)
+    note(worlds, w, 0, goal)
+    away = wp.length(block - goal)
+    touch = wp.max(wp.length(seen(worlds, w, FORCE)), wp.length(seen(worlds, w, OF_TOOL + FORCE)))
+    held = approach(worlds, w, block)
+    if away < near:
+        held = 0.1 * (1.0 - wp.min(touch / GRIP, 1.0))
+    conclude(worlds, w, held - 0.2 * away / 0.05, away < near and touch == 0.0, hold, bonus, False)
 
 
 # --- threading: hold z, peg x, y -------------------------------------------------------------------------------------
@@ -152,8 +203,8 @@ def begin_threading(chosen: wp.array[wp.int32], centre: wp.vec3, above: float, w
     w = wp.tid()
     if chosen[w] == 0:
         return
-    pose = upright(wp.vec3(0.0, 0.0, worlds.draws[w, 4])) * worlds.pose[w]
-    worlds.pose[w] = pose
+    pose = upright(wp.vec3(0.0, 0.0, worlds.draws[w, 4])) * worlds.pose[0, w]
+    worlds.pose[0, w] = pose
     worlds.targets[0, w] = upright(wp.transform_point(pose, centre + wp.vec3(0.0, 0.0, above)))
     peg = wp.vec3(worlds.draws[w, 5], worlds.draws[w, 6], wp.transform_get_translation(worlds.targets[1, w])[2])
     worlds.targets[1, w] = upright(peg)

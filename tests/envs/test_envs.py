@@ -16,9 +16,11 @@ from gymnasium.utils.env_checker import check_env  # noqa: E402
 from gymnasium.vector import AutoresetMode  # noqa: E402
 
 import warp_corot as wc  # noqa: E402
-from warp_corot.envs import TASKS, Lift, Reach, Retract, SingleEnv, Thread  # noqa: E402
+from warp_corot.envs import TASKS, FrankaLift, Lift, Reach, Retract, SingleEnv, Thread  # noqa: E402
 
-KINDS = list(TASKS.values())
+#: Those that need no robot.
+NAMES = [name for name, kind in TASKS.items() if kind is not FrankaLift]
+KINDS = [TASKS[name] for name in NAMES]
 #: A task without much in it, for what is the same in all.
 QUICK = Reach
 
@@ -51,7 +53,7 @@ def succeeded(env, seed):
 # --- what gymnasium asks -------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", TASKS)
+@pytest.mark.parametrize("name", NAMES)
 def test_single_environments_pass_the_checker(name):
     env = gymnasium.make(name, device="cpu").unwrapped
     with warnings.catch_warnings():
@@ -60,7 +62,7 @@ def test_single_environments_pass_the_checker(name):
         check_env(env, skip_render_check=True)
 
 
-@pytest.mark.parametrize("name", TASKS)
+@pytest.mark.parametrize("name", NAMES)
 def test_spaces_and_arrays(name, device):
     env = gymnasium.make_vec(name, num_envs=3, device=device)
     assert isinstance(env, TASKS[name])
@@ -324,6 +326,14 @@ def test_fast_thin_tools_have_more_implicit_steps(kind):
     env.reset(seed=0)
     env.step(np.ones((1, env.task.actions), np.float32))
     assert env.substeps > 2
+
+
+@pytest.mark.slow  # MuJoCo-Warp is compiled for minutes
+def test_an_arm_lifts_a_block(device):
+    pytest.importorskip("mujoco_warp")
+    env = FrankaLift(8, device=device)
+    assert succeeded(env, seed=0).sum() >= 7
+    check_env(gymnasium.make("warp_corot/FrankaLift-v0", device=device).unwrapped, skip_render_check=True)
 
 
 def test_a_single_environment_is_a_world():

@@ -9,19 +9,18 @@ from functools import partial
 
 from gymnasium import register
 
-from .lift import Lift
-from .palpate import Palpate
-from .reach import Reach
-from .retract import Retract
+from .blocks import Lift, Stack
+from .franka import FrankaLift
 from .single import SingleEnv
 from .soft_env import SoftEnv
 from .task import Scene, Task
-from .thread import Thread
+from .tissue import Palpate, Reach, Retract, Thread
 
-__all__ = ["TASKS", "Lift", "Palpate", "Reach", "Retract", "Scene", "SingleEnv", "SoftEnv", "Task", "Thread"]
+__all__ = ["TASKS", "FrankaLift", "Lift", "Palpate", "Reach", "Retract", "Scene", "SingleEnv", "SoftEnv", "Stack"]
+__all__ += ["Task", "Thread"]
 
 #: The environments by their names in gymnasium.
-TASKS = {f"warp_corot/{kind.__name__}-v0": kind for kind in (Retract, Palpate, Reach, Lift, Thread)}
+TASKS = {f"warp_corot/{kind.__name__}-v0": kind for kind in (Retract, Palpate, Reach, Lift, Thread, Stack, FrankaLift)}
 
 for _name, _kind in TASKS.items():
     register(_name, entry_point=partial(SingleEnv, _kind), vector_entry_point=_kind)

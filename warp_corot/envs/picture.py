@@ -37,8 +37,9 @@ def draw_world(env: SoftEnv, world: int = 0) -> npt.NDArray[np.uint8]:
     points, faces = [copy.positions.numpy().astype(np.float64)], [body.surface_triangles]
     values = [average(env.sim.von_mises()[copy.elements])]
     given: list[Obstacle] = [*scene.tools, *scene.obstacles]
-    for each, pose in zip(given, poses_of(given, world), strict=True):
-        if (solid := solid_of(shape_of(each))) is not None:
+    rigid = [*zip(map(shape_of, given), poses_of(given, world), strict=True), *env.decorations(world)]
+    for shape, pose in rigid:
+        if (solid := solid_of(shape)) is not None:
             faces.append(solid.triangles + sum(map(len, points)))
             points.append(solid.at(pose))
             values.append(np.full(len(points[-1]), np.nan))

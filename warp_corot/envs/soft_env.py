@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from typing import Any, ClassVar
 
@@ -23,6 +23,7 @@ from warp_corot.contact.contacts import Contacts
 from warp_corot.contact.grasp import Grasp
 from warp_corot.contact.obstacles import LARGEST_SHARE
 from warp_corot.contact.options import Contact
+from warp_corot.contact.shapes import Shape
 from warp_corot.discretization.discretization import centroids
 from warp_corot.elasticity import Corotated
 from warp_corot.errors import InputError, UnstableError
@@ -33,7 +34,7 @@ from warp_corot.simulation.simulation import Simulation
 from warp_corot.solvers import BackwardEuler, Integrator, SymplecticEuler
 from warp_corot.solvers.recorded import Segment
 
-from .task import Scene, Task
+from .task import Actions, Scene, Task
 
 #: Actions, observations, rewards and flags as arrays of these.
 ARRAYS = ("numpy", "torch", "warp")
@@ -94,6 +95,8 @@ class SoftEnv(VectorEnv):
         "autoreset_mode": AutoresetMode.NEXT_STEP,
     }
     task: ClassVar[Task]
+    #: How often in a step tools are sent to new places.
+    exchanges: ClassVar[int] = 1
 
     def __init__(
         self,
@@ -146,12 +149,24 @@ class SoftEnv(VectorEnv):
         """What the task is made of."""
 
     @abstractmethod
-    def scripted_actions(self, observations: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+    def scripted_actions(self, observations: Actions) -> Actions:
         """Actions of a policy by hand, which succeeds: float32 [n, A] for observations float32 [n, K]."""
 
     def launch_actions(self) -> None:
         """Launch what actions do to the targets of tools; here they steer the first one."""
         self._launch(kernels.steer, self.num_envs, [*self._steering, self.worlds])
+
+    def launch_exchange(self) -> None:
+        """Launch what a robot that moves the tools does, ``exchanges`` times in a step; here there is none."""
+
+    def launch_places(self, chosen: wp.array) -> None:
+        """Launch the placing of tools, and of a robot that moves them, in chosen worlds, int32 [worlds]."""
+        inputs = [chosen, self.worlds.targets, self._contact.obstacles.motions]
+        self._launch(kernels.place_tools, self.worlds.targets.shape, inputs)
+
+    def decorations(self, world: int) -> Iterable[tuple[Shape, npt.NDArray[np.float64]]]:
+        """What pictures show of a world beside tissue, tools and obstacles: shapes and their poses [7]."""
+        return ()
 
     # --- as an environment -----------------------------------------------------------------------------------------
 
@@ -219,6 +234,14 @@ class SoftEnv(VectorEnv):
 
         return tuple(draw_world(self, world) for world in range(min(self.num_envs, 4)))
 
+    def seen(self, observations: Actions, *names: str) -> list[Actions]:
+        """Named parts of observations, [n, ...] each."""
+        return [observations[:, self.columns[name]] for name in names]
+
+    def toward(self, way: npt.NDArray[np.floating], gain: float = 1.0) -> Actions:
+        """Velocities, within [-1, 1], that go a share of a way [m] in a step."""
+        return np.clip(way * (gain * RATE / self.task.speed), -1.0, 1.0).astype(np.float32)
+
     @property
     def drawn(self) -> dict[str, npt.NDArray[np.float32]]:
         """The drawn numbers of the present episodes, float32 [worlds] each; waits for the device."""
@@ -259,6 +282,8 @@ class SoftEnv(VectorEnv):
         if integrator == "explicit":
             _, single, law = self._simulated(1, stiffest, SymplecticEuler(damping=DAMPING))
             self.substeps = int(np.ceil(1.0 / (RATE * SAFETY * single.stable_dt)))
+        self.substeps = self.exchanges * int(np.ceil(self.substeps / self.exchanges))
+        if integrator == "explicit":
             steps = SymplecticEuler(dt=1.0 / (RATE * self.substeps), damping=DAMPING)
         euler = BackwardEuler(dt=1.0 / (RATE * self.substeps))
         self.scene, self.sim, self._contact = self._simulated(self.num_envs, stiffest, steps or euler)
@@ -277,7 +302,7 @@ class SoftEnv(VectorEnv):
             integrator=steps,
             gravity=(0.0, 0.0, -9.81),
             obstacles=[*scene.tools, *scene.obstacles],
-            contact=Contact(friction=scene.friction),
+            contact=Contact(friction=scene.friction, self_contact=scene.parts is not None),
             deterministic=self._is_deterministic,
         )
         assert sim.contact is not None
@@ -295,6 +320,8 @@ class SoftEnv(VectorEnv):
         kinds: dict[str, Any] = {name: wp.float32 for name in ("peak", "reward", "young", "ratio", *shapes)}
         kinds |= dict.fromkeys(("seed", "number", "step", "streak", "over", "again", "lost", "closed"), wp.int32)
         kinds |= dict.fromkeys(("terminated", "truncated", "success"), wp.bool)
+        parts = np.zeros(len(scene.mesh.points), np.int32) if scene.parts is None else scene.parts
+        shapes["pose"] = (int(parts.max()) + 1, count)
         kinds |= {"pose": wp.transform, "lump": wp.vec4, "targets": wp.transform}
         shapes["targets"] = (len(scene.tools), count)
         for name, kind in kinds.items():
@@ -306,7 +333,7 @@ class SoftEnv(VectorEnv):
         bounds = np.array(list(self.ranges.values()), np.float32).T
         self._low, self._high = (wp.array(each, dtype=wp.float32, device=device) for each in bounds)
         self._centroids = wp.array(centroids(scene.mesh), dtype=wp.vec3, device=device)
-        self._points = wp.array(scene.points, dtype=wp.int32, device=device)
+        self._points, self._parts = (wp.array(each, dtype=wp.int32, device=device) for each in (scene.points, parts))
         self._stress = wp.zeros(self.sim.body.element_count, dtype=wp.float32, device=device)
         for k, tool in enumerate(scene.tools):
             tool.use_poses(worlds.targets[k])
@@ -351,8 +378,11 @@ class SoftEnv(VectorEnv):
         worlds, body, motions = self.worlds, self.sim.body, self._contact.obstacles.motions
         worlds.lost.zero_()
         self.launch_actions()
-        self._launch(kernels.pace_tools, worlds.targets.shape, [1.0 / RATE, worlds.targets, motions])
-        self.sim.recorded.launch(Segment(self.substeps, adopts=True, publishes=True))
+        for _ in range(self.exchanges):
+            self.launch_exchange()
+            inputs = [1.0 / (RATE * self.exchanges), worlds.targets, motions]
+            self._launch(kernels.pace_tools, worlds.targets.shape, inputs)
+            self.sim.recorded.launch(Segment(self.substeps // self.exchanges, adopts=True, publishes=True))
         inputs = [body.world_node_count, FARTHEST, body.state.displacements, worlds]
         self._launch(kernels.find_lost, body.node_count, inputs)
         if self.task.feels_stress:
@@ -374,12 +404,11 @@ class SoftEnv(VectorEnv):
         self._launch(self.task.begin, self.num_envs, [chosen, *self.task.begun, worlds])
         sim.reset(chosen)
         state, discretization = body.state, body.discretization
-        inputs = [chosen, body.world_node_count, worlds.pose, state.rest, state.displacements, state.positions]
-        self._launch(kernels.place_nodes, body.node_count, inputs)
+        inputs = [chosen, body.world_node_count, self._parts, worlds.pose, state.rest]
+        self._launch(kernels.place_nodes, body.node_count, [*inputs, state.displacements, state.positions])
         inputs = [chosen, self._centroids, POISSON, worlds, discretization.mu, discretization.lam]
         self._launch(kernels.write_stiffness, body.element_count, [*inputs, *discretization.lame[:2]])
-        inputs = [chosen, worlds.targets, self._contact.obstacles.motions]
-        self._launch(kernels.place_tools, worlds.targets.shape, inputs)
+        self.launch_places(chosen)
 
     def _launch_observation(self) -> None:
         body, obstacles = self.sim.body, self._contact.obstacles

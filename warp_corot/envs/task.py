@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -15,6 +15,9 @@ from warp_corot.contact.shapes import Shape, Vector
 from warp_corot.contact.tool import Tool
 from warp_corot.mesh.forest import TetForest
 from warp_corot.mesh.tetmesh import TetMesh
+
+#: Observations or actions, float32 [n, ...].
+Actions = npt.NDArray[np.float32]
 
 
 @dataclass
@@ -28,6 +31,7 @@ class Scene:
         obstacles: Obstacles at rest.
         points: Observed nodes, [P].
         centre: About which the tissue is turned [m].
+        parts: Which part of the mesh each node is of, [n], where parts are placed by themselves; None: it is one.
         gripped: Nodes that the first tool holds while it is closed; None: it is no gripper.
         reach: Distance from its origin at which it takes hold of them [m].
         friction: Coefficient of friction of all contacts without their own.
@@ -39,6 +43,7 @@ class Scene:
     obstacles: list[Shape]
     points: npt.NDArray[np.integer]
     centre: Vector
+    parts: npt.NDArray[np.integer] | None = None
     gripped: Nodes | None = None
     reach: float = 0.0
     friction: float = 0.3
@@ -57,11 +62,11 @@ class Task:
         actions: How many actions there are.
         speed: The largest speed of tools along each axis [m/s].
         workspace: Lowest and highest place of the tools' origin [m].
+        window: Lowest and highest corner of what pictures show [m].
+        view: Azimuth and elevation of the camera [°].
         notes: Names and sizes of the task's own numbers among the observations.
         steps: Steps of an episode until it is cut off.
         feels_stress: Whether steps find the largest stress of the tissue.
-        window: Lowest and highest corner of what pictures show [m].
-        view: Azimuth and elevation of the camera [°].
     """
 
     ranges: Mapping[str, tuple[float, float]]
@@ -72,11 +77,16 @@ class Task:
     actions: int
     speed: float
     workspace: tuple[Vector, Vector]
-    notes: Mapping[str, int]
-    steps: int
     window: tuple[Vector, Vector]
     view: tuple[float, float]
+    notes: Mapping[str, int] = field(default_factory=dict)
+    steps: int = 200
     feels_stress: bool = False
+
+
+def symmetric(**largest: float) -> dict[str, tuple[float, float]]:
+    """Ranges around zero."""
+    return {name: (-most, most) for name, most in largest.items()}
 
 
 def box(
