@@ -278,6 +278,16 @@ def test_obstacles_of_every_form_are_in_a_stage(folder):
     assert UsdValidation.ValidationContext(validators).Validate(stage) == []
 
 
+@pytest.mark.parametrize("lift", [0.0, 0.06])
+def test_two_pieces_lie_on_a_ground_if_both_reach_it(folder, capsys, lift):
+    pieces = [trimesh.creation.icosphere(2, 0.03) for _ in range(2)]
+    pieces[1].apply_translation((0.1, 0.0, lift))
+    trimesh.util.concatenate(pieces).export(folder / "pair.stl")
+    asked = ["--unit", "m", "--tets", 800, "--duration", 0.1, "--fps", 10, "--device", "cpu", "-o", "a.usd"]
+    assert simulate("pair.stl", *asked) == 0
+    assert ("pair, lying on a ground" in capsys.readouterr().out) == (lift == 0.0)
+
+
 def test_an_organ_without_flat_feet_lies_on_a_ground(folder, capsys):
     trimesh.creation.capsule(0.08, 0.03).export(folder / "organ.stl")
     trimesh.creation.cylinder(0.04, 0.03).export(folder / "drum.stl")
