@@ -2,6 +2,7 @@
 
 from types import SimpleNamespace
 
+import meshio
 import numpy as np
 import pytest
 from command_line import simulate
@@ -26,6 +27,17 @@ def test_steps_that_would_be_unstable_are_implicit(tmp_path, capsys):
     path = ["-o", tmp_path / "box.usd"]
     assert steps_of(capsys, *path, "--young", "30kPa", "--dt", "16ms") == (True, True)
     assert steps_of(capsys, *path, "--young", "10Pa", "--dt", "4ms") == (False, False)
+    assert steps_of(capsys, *path, "--young", "30kPa", "--dt", "16ms", "--self-contact") == (True, True)
+
+
+def test_tetrahedra_of_a_file_take_implicit_steps_if_explicit_ones_are_unstable(tmp_path, capsys):
+    mesh = wc.TetForest.box((1, 1, 2), 0.1, 3)
+    meshio.write(tmp_path / "bar.vtk", meshio.Mesh(mesh.points, {"tetra": mesh.tets}))
+    given = [tmp_path / "bar.vtk", "--young", "30kPa", "--device", "cpu", "--duration", "0.1", "-o", tmp_path / "a.usd"]
+    assert simulate(*given, "--dt", "20ms") == 0
+    assert "backward-euler" in capsys.readouterr().out
+    assert simulate(*given) == 0
+    assert "backward-euler" not in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(

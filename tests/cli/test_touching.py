@@ -128,14 +128,13 @@ def test_two_tools_have_their_own_places(block, folder):
 
 
 @pytest.mark.parametrize("tool", ["sphere:r=1cm", "capsule:r=0.3mm,l=30mm"])
-def test_a_start_inside_is_noted(block, folder, capsys, tool):
+def test_a_start_inside_is_said(block, folder, capsys, tool):
     """This includes a needle with no node inside it."""
     write_path(folder, "0,0.0137,0.0121,0.012\n")
     args = ["--tool", tool, "--tool-path", "path.csv", "--fix", "z == zmin", "-o", "a.usd", *SHORT]
     assert simulate("block.vtk", *args) == 0
-    notes = [line for line in capsys.readouterr().err.splitlines() if "pushed apart gently" in line]
-    assert len(notes) == 1
-    assert "tool 1 starts" in notes[0]
+    said = [line for line in capsys.readouterr().err.splitlines() if "begin" in line and "inside" in line]
+    assert any(line.startswith("warp-corot: warning: a ") and "begins inside a soft body" in line for line in said)
 
 
 def test_a_coarse_ball_lands_on_its_surface(block, folder, capsys):
@@ -277,6 +276,16 @@ def test_obstacles_of_every_form_are_in_a_stage(folder):
     np.testing.assert_allclose(ends, (1, 0.01, 0.005), atol=1e-6)
     validators = UsdValidation.ValidationRegistry().GetOrLoadAllValidators()
     assert UsdValidation.ValidationContext(validators).Validate(stage) == []
+
+
+@pytest.mark.parametrize("lift", [0.0, 0.06])
+def test_two_pieces_lie_on_a_ground_if_both_reach_it(folder, capsys, lift):
+    pieces = [trimesh.creation.icosphere(2, 0.03) for _ in range(2)]
+    pieces[1].apply_translation((0.1, 0.0, lift))
+    trimesh.util.concatenate(pieces).export(folder / "pair.stl")
+    asked = ["--unit", "m", "--tets", 800, "--duration", 0.1, "--fps", 10, "--device", "cpu", "-o", "a.usd"]
+    assert simulate("pair.stl", *asked) == 0
+    assert ("pair, lying on a ground" in capsys.readouterr().out) == (lift == 0.0)
 
 
 def test_an_organ_without_flat_feet_lies_on_a_ground(folder, capsys):

@@ -9,7 +9,7 @@ import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -160,8 +160,6 @@ def _named_columns(row: list[str], path: Path) -> dict[str, float]:
 
 # --- what the bodies touch -------------------------------------------------------------------------------------------
 
-#: Overlaps below this fraction of a body's height are rounding and are not reported.
-SMALL = 1e-5
 #: Tetrahedra that reach farther than this beyond the surface, relative to the height of the body, are said.
 FAR = 0.01
 
@@ -282,35 +280,6 @@ def say_reach(bodies: Sequence[RunBody], sim: Simulation) -> None:
                 f"contact acts on the tetrahedra, which reach {length(mean)} beyond the surface on average and "
                 f"{length(most)} at most; more tetrahedra (--tets) reach less far"
             )
-
-
-def say_overlaps(touched: RunContact, bodies: Sequence[RunBody], sim: Simulation) -> None:
-    """Add a note for each body on the obstacles that it overlaps before the run begins."""
-    if sim.contact is None or not touched.obstacles:
-        return
-    obstacles = sim.contact.obstacles
-    for body, part in zip(bodies, sim.contact.surface.parts, strict=True):
-        own = part.skin.own
-        at = body.soft.mesh.points[body.subject.used] if own is None else own.points
-        deepest = -obstacles.gaps(at, float(body.subject.height)).min(axis=1)
-        poses = obstacles.poses()[0]
-        for (name, each), depth, pose in zip(touched.obstacles.items(), deepest, poses, strict=True):
-            where = f"{name} starts {length(float(depth))} deep in the body"
-            if depth <= SMALL * body.subject.height:
-                if isinstance(each, Ground) or not _holds_axis(body.soft.mesh, each, pose):
-                    continue
-                where = f"{name} starts in the body"
-            body.subject.notes.append(f"{where}; they are pushed apart gently")
-
-
-def _holds_axis(mesh: Any, obstacle: Obstacle, pose: Floats) -> bool:
-    """Whether a mesh contains a point of an obstacle's axis, which may lie between its nodes."""
-    shape = obstacle.shape if isinstance(obstacle, Tool) else obstacle
-    half = shape.size[1] if isinstance(shape, Capsule | Cylinder) else 0.0
-    x, y, z, w = pose[3:]
-    axis = np.array([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)])
-    places = pose[:3] + np.linspace(-half, half, 33)[:, None] * axis
-    return bool((mesh.embed(places)[1] >= 0.0).all(axis=1).any())
 
 
 def _described(obstacle: Obstacle) -> str:

@@ -24,7 +24,7 @@ from warp_corot.simulation.static import solve_static
 from warp_corot.solvers import INTEGRATORS, BackwardEuler, Integrator, QuasiStatic, SymplecticEuler
 
 from .bodies import RunBody, asked_bodies, find_body, find_patches, gravity_of, make_body
-from .contact import RunContact, make_blade, place_ground, say_overlaps, say_reach, touched_by
+from .contact import RunContact, make_blade, place_ground, say_reach, touched_by
 from .options import IMPLICIT_DT, integrator_name, is_static
 from .patches import press_patches, ramp_of
 from .results import Probe
@@ -104,7 +104,6 @@ def _made_ready(options: Sequence[argparse.Namespace], touches: bool, chooses: b
         choose_steps(shared, bodies, touched, device)
     with waiting("preparing the simulation"):
         sim = make_simulation(shared, bodies, touched)
-        say_overlaps(touched, bodies, sim)
         say_reach(bodies, sim)
     for body in bodies:
         press_patches(sim, body.soft, body.loads, body.patches, ramp_of(shared, duration))
@@ -228,6 +227,8 @@ def _tried_step(one: RunBody, damping: float, viscosity: float) -> float:
 
 #: The steps that follow the state, over the largest stable one at rest.
 SHORTER = 0.75
+#: The largest stable step over its estimate, for meshes other than forests.
+UNSURE = 2.5
 #: Bodies with shorter stable steps than this [s] are left to the explicit ones, which refuse them.
 SHORTEST = 1e-12
 #: Steps up to this length [s] are explicit if users give it.
@@ -255,39 +256,42 @@ ON_CUDA = Cost(12e-6, 25e-12, 40.0), Cost(1.5e-3, 50e-9, 3.0)
 
 
 def choose_steps(args: argparse.Namespace, bodies: Sequence[RunBody], touched: RunContact, device: wp.Device) -> None:
-    """Set ``integrator`` of a body's options to implicit steps if explicit ones would be slower than real time and
-    much slower than these, or unstable with the step that users give; a note of the body says so.
+    """Set ``integrator`` of the options to implicit steps if explicit ones would be unstable with the step that users
+    give, or slower than real time and much slower than implicit ones; a note says so.
 
-    The choice is made for one body of the corotated law on a forest, which touches neither itself nor other bodies.
+    Speeds are compared for one body of the corotated law on a forest, which touches neither itself nor other bodies.
     """
-    if not may_choose(bodies):
+    if args.integrator or is_static(args) or are_several():
         return
-    body = bodies[0]
-    model, mesh = body.model, body.soft.mesh
-    if not (isinstance(model, Corotated) and model.level is None and isinstance(mesh, TetForest)):
-        return
-    explicit, implicit = ON_CUDA if device.is_cuda else ON_CPU
-    size = len(mesh.tets), touched.contact is not None
-    step = _stable_step(body)
-    if step < SHORTEST:
-        return
-    slow = SHORTER * step / explicit.of(*size)
-    fast = (args.dt or IMPLICIT_DT) / implicit.of(*size)
-    if args.dt is not None and args.dt > FASTER * step:
-        why = f"unstable from about {1e3 * step:.2g} ms on"
-    elif args.dt is None and slow < 1.0 and fast >= FASTER * slow:
-        why = f"about {fast / slow:.1g} times as slow"
+    step = min(map(_stable_step, bodies))
+    sure = 1.0 if all(isinstance(body.soft.mesh, TetForest) for body in bodies) else UNSURE
+    if args.dt is not None and args.dt > FASTER * sure * step:
+        why = f"unstable in steps of {1e3 * args.dt:.3g} ms"
+    elif args.dt is None and may_choose(bodies) and (times := _times_as_slow(bodies[0], step, touched, device)):
+        why = f"about {float(f'{times:.1g}'):.0f} times as slow"
     else:
         return
     args.integrator = "backward-euler"
-    body.subject.notes.append(
+    bodies[0].subject.notes.append(
         f"implicit steps, which damp vibrations, since explicit ones would be {why} "
         "(--integrator symplectic-euler makes those)"
     )
 
 
+def _times_as_slow(body: RunBody, step: float, touched: RunContact, device: wp.Device) -> float:
+    """How many times as slow as implicit steps explicit ones would be, if they are too slow; otherwise zero."""
+    model, mesh = body.model, body.soft.mesh
+    compared = isinstance(model, Corotated) and model.level is None and isinstance(mesh, TetForest)
+    if not compared or step < SHORTEST:
+        return 0.0
+    explicit, implicit = ON_CUDA if device.is_cuda else ON_CPU
+    size = len(mesh.tets), touched.contact is not None
+    slow, fast = SHORTER * step / explicit.of(*size), IMPLICIT_DT / implicit.of(*size)
+    return fast / slow if slow < 1.0 and fast >= FASTER * slow else 0.0
+
+
 def may_choose(bodies: Sequence[RunBody]) -> bool:
-    """Whether the options leave the choice open."""
+    """Whether the options leave the choice to the speeds of steps."""
     args = bodies[0].args
     is_short = args.dt is not None and args.dt <= SHORT_STEP
     given = args.integrator or is_short or args.viscosity or is_static(args) or are_several()
@@ -296,7 +300,8 @@ def may_choose(bodies: Sequence[RunBody]) -> bool:
 
 def _stable_step(body: RunBody) -> float:
     """An estimate of the largest stable step at rest [s]: the smallest height of an element over the speed of sound. It
-    was within 10 % for four uniform organs and a box, and is within 25 % where stiffness jumps."""
+    was within 10 % for four uniform organs and a box, is within 25 % where stiffness jumps, and was 0.43 of it for a
+    bear of split voxels."""
     mesh, material = body.soft.mesh, body.soft.discretization
     x = mesh.points[mesh.tets].astype(float)
     faces = np.array([(1, 2, 3), (0, 2, 3), (0, 1, 3), (0, 1, 2)])

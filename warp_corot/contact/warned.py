@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
+from warp_corot.domain.units import length
 from warp_corot.errors import StabilityWarning, depth_of_user
 from warp_corot.kernels.contact import shapes as kinds
 from warp_corot.kernels.contact import sums
@@ -52,7 +53,7 @@ def warn_of_overlaps(contacts: Contacts, least: float) -> None:
         deep, ranks = depths.numpy(), ALONE if contacts.surface.is_whole else contacts.system.ranks
         count, deepest = int(ranks.sum(int((deep > least).sum()))), ranks.max(float(deep.max(initial=0.0)))
         if count:
-            _warn(f"{count} surface nodes begin inside obstacles, by up to {1e3 * deepest:.3g} mm; they are {speed}")
+            _warn(f"{count} surface nodes begin inside obstacles, by up to {length(deepest)}; they are {speed}")
     axes = [(tool, _axis(tool, contacts.obstacles.poses()[0, k])) for k, tool in enumerate(contacts.obstacles.tools)]
     axes = [(tool, points) for tool, points in axes if len(points)]
     if len(contacts.surface.parts) > 1 or axes:
@@ -90,9 +91,9 @@ def warn_of_crushed(contacts: Contacts) -> bool:
     crushed = int(system.ranks.sum(int(count.numpy()[0])))
     if crushed:
         _warn(
-            f"{crushed} elements are turned inside out at t = {system.pace.time:.4g} s: something presses harder than "
-            "they bear. Tissue would tear there, and contact forces are rough meanwhile; slower or blunter tools, "
-            "finer elements or the model NeoHookean help"
+            f"{crushed} element{' is' if crushed == 1 else 's are'} turned inside out at t = {system.pace.time:.4g} s: "
+            "something presses harder than they bear. Tissue would tear there, and contact forces are rough meanwhile; "
+            "slower or blunter tools, finer elements or the model NeoHookean help"
         )
     return crushed > 0
 
@@ -112,10 +113,11 @@ def _warn_of_coarse_elements(contacts: Contacts, surfaces: Sequence[Surface], to
     size = tool.shape.thickness
     if edge > size and body.changing is None and (tool.keys is not None or tool.is_sent):
         fine = FITTING * size
+        count = float(f"{len(body.mesh.tets) * (edge / fine) ** 3:.1g}")
         _warn(
-            f"a {tool.shape!r}, {2e3 * size:.3g} mm thick, is small for the elements under it, whose edges are "
-            f"{1e3 * edge:.3g} mm: its force will be off by tens of per cent; edges of {1e3 * fine:.2g} mm would "
-            f"do, in all some {len(body.mesh.tets) * (edge / fine) ** 3:.0e} elements, or OnlineRemesh(near=tool)"
+            f"a {tool.shape!r}, {length(2.0 * size)} thick, is small for the elements under it, whose edges are "
+            f"{length(edge)}: its force will be off by tens of per cent; edges of {length(fine)} would do, in all "
+            f"some {count:,.0f} elements, or OnlineRemesh(near=tool)"
         )
 
 
@@ -134,8 +136,8 @@ def _warn_of_what_bodies_hold(
     deep = deepest[: ends[len(own)]]
     if count := int((deep > least).sum()):
         _warn(
-            f"{count} surface nodes begin inside another soft body, by up to {1e3 * deep.max():.3g} mm; overlaps of up "
-            f"to a quarter of an element are {speed}, deeper ones stay"
+            f"{count} surface nodes begin inside another soft body, by up to {length(deep.max())}; overlaps of up to "
+            f"a quarter of an element are {speed}, deeper ones stay"
         )
     for (tool, _), start, end in zip(axes, ends[len(own) :], ends[len(own) + 1 :], strict=False):
         if (deepest[start:end] > least).any():

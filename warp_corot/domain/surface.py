@@ -158,7 +158,7 @@ class SurfaceDomain(SignedFunction):
             (closed.turned, f"{closed.turned} triangles wound against their neighbours turned round"),
             (closed.inside_out, f"{closed.inside_out} part{'s'[: closed.inside_out != 1]} inside out turned round"),
             (closed.pieces > 1, f"{closed.pieces} separate parts"),
-            (closed.cavities, f"{closed.cavities} cavities"),
+            (closed.cavities, f"{closed.cavities} cavit{'y' if closed.cavities == 1 else 'ies'}"),
             (self.overlapping, f"parts overlap in {self.overlapping:.1%} of what is enclosed"),
             (self.reversed, f"{self.reversed:.1%} of what is enclosed is inside out and left out"),
         ]

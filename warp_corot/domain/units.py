@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import math
 import re
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -128,19 +129,27 @@ def likely_unit(size: float, scan: bool = False) -> str:
     return "mm" if scan or size * UNITS["mm"] >= SMALLEST_IN_MM else "cm"
 
 
+#: Units of lengths [m], volumes [m^3] and pressures [Pa], from the largest to the smallest, each with its size.
+LENGTHS = (("m", 1.0), ("mm", 1e-3), ("um", 1e-6))
+VOLUMES = (("m^3", 1.0), ("l", 1e-3), ("ml", 1e-6), ("mm^3", 1e-9))
+PRESSURES = (("GPa", 1e9), ("MPa", 1e6), ("kPa", 1e3), ("Pa", 1.0))
+
+
+def _suited(value: float, units: Sequence[tuple[str, float]], digits: int = 3) -> str:
+    """A value in the first unit that makes it at least one, or in the last; zero in the SI unit."""
+    value = float(f"{value:.{digits}g}")
+    unit, size = next((each for each in units if abs(value or 1.0) >= each[1]), units[-1])
+    return f"{float(f'{value / size:.{digits}g}'):g} {unit}"
+
+
 def length(metres: float) -> str:
     """A length to three digits in the unit that suits it."""
-    if metres == 0.0 or abs(metres) >= 1.0:
-        return f"{metres:.3g} m"
-    return f"{1e3 * metres:.3g} mm" if abs(metres) >= 1e-3 else f"{1e6 * metres:.3g} um"
+    return _suited(metres, LENGTHS)
 
 
 def volume(cubic_metres: float) -> str:
     """A volume to three digits, in cubic metres, litres, millilitres or cubic millimetres."""
-    for unit, factor in (("m^3", 1.0), ("l", 1e3), ("ml", 1e6)):
-        if abs(cubic_metres) * factor >= 1.0:
-            return f"{cubic_metres * factor:.3g} {unit}"
-    return f"{cubic_metres * 1e9:.3g} mm^3"
+    return _suited(cubic_metres, VOLUMES)
 
 
 def check_float32(bounds: np.ndarray) -> None:
@@ -186,7 +195,4 @@ def unlikely_size(size: float, metres: float) -> str | None:
 
 def pressure(pascals: float) -> str:
     """A pressure in Pa, kPa, MPa or GPa."""
-    for unit, factor in (("GPa", 1e9), ("MPa", 1e6), ("kPa", 1e3)):
-        if pascals >= factor:
-            return f"{pascals / factor:g} {unit}"
-    return f"{pascals:g} Pa"
+    return _suited(pascals, PRESSURES, 6)

@@ -433,8 +433,8 @@ def supports_of(
         density: Density [kg/m^3], a number or [T].
         gravity: Acceleration [m/s^2], [3].
         surface: A ``SurfaceMesh`` bound to the mesh, if the body ends within its tetrahedra; None: their boundary.
-        may_lie: Whether a body may lie on a ground: it does if it has no flat feet or does not stand on them, and all
-            pieces but one are small.
+        may_lie: Whether a body may lie on a ground: it does if a piece that is not small has no flat feet or does not
+            stand on them, and all such pieces reach down to the lowest tenth of its height.
     """
     g = np.asarray(gravity, dtype=np.float64)
     up = np.eye(3)["XYZ".index(mesh.up_axis)] if not g.any() else -g / np.linalg.norm(g)
@@ -451,7 +451,10 @@ def supports_of(
     holds, count = [], int(of_tet.max()) + 1
     of_piece = np.bincount(of_tet, volumes)
     small = (np.bincount(of_tet) < SMALL_PIECE) | (of_piece < SMALL_SHARE * of_piece.max())
-    may_lie = may_lie and bool(g.any()) and np.count_nonzero(~small) == 1
+    if may_lie := may_lie and bool(g.any()):
+        heights = drawn @ up
+        lows = np.array([heights[triangles[of_triangle == number]].min(initial=np.inf) for number in range(count)])
+        may_lie = bool((lows[~small] <= heights.min() + LOWEST * np.ptp(heights)).all())
     for number in range(count):
         inside, around = of_tet == number, triangles[of_triangle == number]
         tets = mesh.tets[inside]

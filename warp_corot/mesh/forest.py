@@ -214,7 +214,7 @@ class TetForest(ForestArrays):
         return largest_piece(self)
 
     def summary(self) -> list[str]:
-        """A summary of the mesh, line by line: counts by level and type, volume, labels, pieces."""
+        """A summary of the mesh, line by line: counts, levels, volume, labels, pieces."""
         return summary(self)
 
 

@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.sparse import csr_array
 
+from warp_corot.domain.units import volume
 from warp_corot.errors import InputError
 from warp_corot.mesh.lattice import LATTICE_BITS
 from warp_corot.mesh.surfaces.marching import Detail
@@ -95,14 +96,12 @@ def summary(forest: ForestArrays) -> list[str]:
     x, y, z = forest.cells
     count = len(forest.tets)
     lines = [f"{count} tetrahedra, {forest.node_count} nodes, from {x} x {y} x {z} cubes of {forest.cell_size:g} m"]
-    for level, number in enumerate(np.bincount(forest.levels)):
-        if number:
-            lines.append(f"level {level}, type {level % 3}: {number}")
-    volume = float(np.sum(forest.volumes))
+    lowest, highest = int(forest.levels.min()), int(forest.levels.max())
+    lines.append(f"levels {lowest} to {highest}" if lowest < highest else f"level {lowest}")
     if forest.fill is not None:
-        inside = float(np.sum(forest.fill * forest.volumes))
+        inside, whole = float(np.sum(forest.fill * forest.volumes)), float(np.sum(forest.volumes))
         cut = np.count_nonzero(forest.fill != 1.0)
-        lines.append(f"{inside:.6g} m^3 of body in {volume:.6g} m^3 of tetrahedra, {cut} of which are cut")
+        lines.append(f"{volume(inside)} of body in {volume(whole)} of tetrahedra, {cut} of which are cut")
     lines += [f"label {name}: {np.count_nonzero(forest.elements_of(name))} tetrahedra" for name in forest.label_names]
     sizes = np.bincount(pieces_of(forest.tets))
     if len(sizes) > 1:
