@@ -58,8 +58,8 @@ def is_short(model, case):
 
 @pytest.mark.parametrize(("model", "case"), crossed(MODELS, CASES, is_short))
 def test_product_equals_differences_of_the_oracles_forces(model, case, device, rng):
-    """Strains around 0.3, on forests of all three types and on a general mesh; with the invariants and the diagonal blocks of
-    K there."""
+    """Strains around 0.3, on forests of all three types and on a general mesh; with the invariants and
+    the diagonal blocks of K there."""
     mesh = MESHES[case]()
     field = bound(mesh, model, device)
     u, p = displaced(mesh, model, rng), random_displacement(mesh, rng, 1.0)
