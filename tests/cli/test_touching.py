@@ -20,7 +20,6 @@ from warp_corot.errors import InputError
 BLOCK = wc.TetForest.box((2, 2, 1), 0.02, 3)
 SOFT = ["--young", "20kPa", "--poisson", 0.4, "--density", 1000, "--viscosity", "2ms", "--device", "cpu"]
 WEIGHT = 9.81 * 1000 * 0.04 * 0.04 * 0.02
-TOP = 0.02
 
 
 @pytest.fixture
