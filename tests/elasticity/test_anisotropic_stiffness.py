@@ -150,7 +150,11 @@ def test_filled_share_and_worlds(device, rng):
     assert_diagonal(field, u, rng.choice(len(u), 2, replace=False))
 
 
-@pytest.mark.parametrize("model", [wc.Corotated(subtrees=False), wc.Corotated(rotation="svd")], ids=repr)
+@pytest.mark.parametrize(
+    "model",
+    [pytest.param(wc.Corotated(subtrees=False), marks=pytest.mark.slow), wc.Corotated(rotation="svd")],
+    ids=repr,
+)
 def test_other_rotations_give_the_same(model, device, rng):
     mesh = mixed_forest()
     material, _ = made("wood", mesh, rng)

@@ -257,7 +257,14 @@ def test_nothing_becomes_nan(name, device, rng):
 
 
 @pytest.mark.parametrize(
-    "model", [wc.Corotated(rotation="svd"), wc.Corotated(iterations=6), wc.Corotated(subtrees=False)]
+    "model",
+    [
+        wc.Corotated(rotation="svd"),
+        *(
+            pytest.param(wc.Corotated(**each), marks=pytest.mark.slow)
+            for each in ({"iterations": 6}, {"subtrees": False})
+        ),
+    ],
 )
 def test_other_ways_to_find_rotations(model, device, rng):
     mesh = MESHES["general"]()
