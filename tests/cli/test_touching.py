@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from command_line import SHORT, assert_refused, run, simulate
+from command_line import SHORT, assert_refused, simulate
 from input_files import write_vtk
 from PIL import Image
 from pxr import Usd, UsdGeom, UsdValidation
@@ -246,11 +246,6 @@ def test_columns_with_units_and_without_names_are_the_same(folder):
     np.testing.assert_allclose(turns, [(0, 0, 0, 1)] * 2)
     with pytest.raises(InputError, match="cannot be read"):
         read_tool_path(folder)
-
-
-def test_tool_options_are_in_the_help(folder, capsys):
-    assert run("simulate", "--help") == 0
-    assert "--tool-path" in capsys.readouterr().out
 
 
 def test_obstacles_of_every_form_are_in_a_stage(folder):
