@@ -22,6 +22,26 @@ wp.config.quiet = True
 wp.config.enable_backward = False
 wp.init()
 
+from warp_corot.inputs import loading
+
+#: Folders whose tests have loops in real time, in which nothing may be compiled.
+IN_TIME = {"haptics", "viewing"}
+_compiles_all = [False]
+
+
+def _begin_loading(names, device, kernels=(), begin=loading.begin_loading):
+    """Simulations load all kernels of their laws before the first step. On the CPU tests compile only those that they
+    launch, which takes two thirds of the time; programs that tests start, as test_loading does, load all of them."""
+    return begin(names, device, kernels) if _compiles_all[0] or wp.get_device(device).is_cuda else []
+
+
+# Before modules of the package take it by name.
+loading.begin_loading = _begin_loading
+
+
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    _compiles_all[0] = item.path.parent.name in IN_TIME
+
 
 def pytest_sessionstart() -> None:
     """Collect no garbage while modules and tests are collected: imports make next to none."""

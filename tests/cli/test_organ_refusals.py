@@ -12,7 +12,9 @@ from input_files import write_scan, write_surface
 from warp_corot.cli.input_mesh import parse_labels
 
 
-def refused_files(folder: Path) -> None:
+@pytest.fixture(scope="module")
+def refused_files(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("refused")
     write_surface(folder / "organ.obj", False)
     write_scan(folder / "scan.nii.gz")
     grey = nibabel.Nifti1Image(np.resize(np.arange(-20, 281), (12, 12, 12)).astype(np.int16), np.eye(4))
@@ -31,6 +33,7 @@ def refused_files(folder: Path) -> None:
     (folder / "text.nii.gz").write_text("not a scan")
     (folder / "empty.glb").write_bytes(b"")
     write_surface(folder / "out.usda", False)
+    return folder
 
 
 REFUSED = [
@@ -96,9 +99,9 @@ REFUSED = [
 
 
 @pytest.mark.parametrize(("args", "said"), REFUSED, ids=[" ".join(args)[:60] for args, _ in REFUSED])
-def test_bad_input_is_one_line_and_touches_nothing(folder, args, said, capsys):
-    refused_files(folder)
-    assert_refused(folder, capsys, said, *args, "-o", "out.usda")
+def test_bad_input_is_one_line_and_touches_nothing(refused_files, monkeypatch, args, said, capsys):
+    monkeypatch.chdir(refused_files)
+    assert_refused(refused_files, capsys, said, *args, "-o", "out.usda")
 
 
 def test_pressures():

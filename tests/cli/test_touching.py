@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from command_line import SHORT, assert_refused, run, simulate
+from command_line import SHORT, assert_refused, simulate
 from input_files import write_vtk
 from PIL import Image
 from pxr import Usd, UsdGeom, UsdValidation
@@ -20,7 +20,6 @@ from warp_corot.errors import InputError
 BLOCK = wc.TetForest.box((2, 2, 1), 0.02, 3)
 SOFT = ["--young", "20kPa", "--poisson", 0.4, "--density", 1000, "--viscosity", "2ms", "--device", "cpu"]
 WEIGHT = 9.81 * 1000 * 0.04 * 0.04 * 0.02
-TOP = 0.02
 
 
 @pytest.fixture
@@ -246,11 +245,6 @@ def test_columns_with_units_and_without_names_are_the_same(folder):
     np.testing.assert_allclose(turns, [(0, 0, 0, 1)] * 2)
     with pytest.raises(InputError, match="cannot be read"):
         read_tool_path(folder)
-
-
-def test_tool_options_are_in_the_help(folder, capsys):
-    assert run("simulate", "--help") == 0
-    assert "--tool-path" in capsys.readouterr().out
 
 
 def test_obstacles_of_every_form_are_in_a_stage(folder):

@@ -117,3 +117,4 @@ def test_other_models(model, name, device, rng):
     u = random_displacement(mesh, rng, 0.1) if model == "linear" else turned(mesh, rng, 0.1)
     place(body, u)
     check(sim, body, *reversed(oracle.evaluate(model, oracle_mesh(mesh), mesh.points + u.astype(float), mu, lam)))
+    assert body.masses == pytest.approx(oracle_mesh(mesh).masses(material["density"]), rel=1e-12)

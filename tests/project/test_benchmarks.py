@@ -11,13 +11,9 @@ import sys
 from pathlib import Path
 from types import SimpleNamespace
 
-import numpy as np
-import oracle
 import pytest
 import warp as wp
 from mpirun import needs_mpi
-
-import warp_corot as wc
 
 BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
 SUPPORT = Path(__file__).parents[1] / "support"
@@ -192,21 +188,6 @@ def test_bad_options_are_said_in_one_line(run, script, option, value, said):
 
 
 @pytest.mark.usefixtures("benchmarks")
-def test_a_sample_gives_the_whole_meshs_forces(rng):
-    from problem import Sample
-
-    forest = wc.TetForest.box((1, 1, 1), 1.0, 12)
-    x = forest.points + 0.003 * rng.uniform(-1, 1, forest.points.shape)
-    sample = Sample(forest.points, forest.tets)
-    assert len(sample.nodes) < len(forest.points) / 4
-    whole = oracle.evaluate("corotated", oracle.Mesh(forest.points, forest.tets), x, 3.0, 5.0)[1]
-    found = sample.forces("corotated", x, 3.0, 5.0)
-    assert np.abs(found - whole[sample.nodes]).max() < 1e-12 * np.abs(whole).max()
-    masses = oracle.Mesh(forest.points, forest.tets).masses(7.0)
-    assert np.allclose(sample.masses(7.0), masses[sample.nodes], rtol=1e-12)
-
-
-@pytest.mark.usefixtures("benchmarks")
 @pytest.mark.parametrize("error", [0.02, math.nan, math.inf])
 def test_a_wrong_result_fails_the_run(error, tmp_path, capsys):
     from measure import Case, finish, measure
@@ -221,33 +202,6 @@ def test_a_wrong_result_fails_the_run(error, tmp_path, capsys):
     assert finish(options, {}, results[:1]) == 0
     assert finish(options, {}, results) == 1
     assert "WRONG: stage, off" in capsys.readouterr().err
-
-
-@pytest.mark.usefixtures("benchmarks")
-@pytest.mark.parametrize("limit", [3e-3, 0.7e-4, 1.0])
-def test_the_largest_stable_step_is_found(limit):
-    from stable import LONGEST, PRECISION, Steppable
-
-    class Threshold(Steppable):
-        """A solver that diverges beyond a step."""
-
-        name = "threshold"
-
-        def reset(self):
-            self.far = 0.0
-
-        def step(self, count):
-            self.far += count * (self.dt > limit)
-
-        def largest_displacement(self):
-            return self.far
-
-        def error(self):
-            return 0.0
-
-    found = Threshold().largest_stable_step(guess=1e-3)
-    assert found <= min(limit, LONGEST)
-    assert found >= min(limit, LONGEST) / PRECISION
 
 
 def test_remesh(run, device, tmp_path):

@@ -2,7 +2,7 @@
 
 import json
 import sys
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from functools import cache
 from pathlib import Path
 
@@ -27,10 +27,8 @@ from paper_beam import (
     Case,
     Settings,
     beam,
-    cases,
     follow,
     run_experiment,
-    work,
 )
 from paper_report import judged_claims
 
@@ -97,38 +95,6 @@ def test_the_full_experiment(device):
     assert all(claim.holds for claim in list(named.values())[:3])
 
 
-def test_samples_are_those_of_an_uninterrupted_run(device):
-    """Sampling does not change the beam's motion."""
-    results = coarse(device)
-    body = wc.SoftBody(results.mesh, wc.Isotropic(young=500.0, poisson=0.49, density=10.0), device=device)
-    body.fix(results.mesh.points[:, 2] < 1e-9)
-    integrator = wc.SymplecticEuler(dt=2e-4, damping=15.0)
-    model = wc.StVenantKirchhoff(dilatation="element")
-    sim = wc.Simulation(body, model=model, integrator=integrator, gravity=(0.0, -9.8, 0.0))
-    sim.advance(results.times[-1])
-    ended = results.mesh.points + body.displacements.numpy()
-    # bit by bit on one thread; on a GPU sums are taken in any order
-    assert np.abs(ended - results.runs[REFERENCE].positions).max() <= (0.0 if device == "cpu" else 1e-6)
-
-
-def test_the_shipped_path_goes_where_leaf_by_leaf_goes(device):
-    """Errors and shapes hold for the path whose stages are timed: both beams fall alike, to rounding."""
-    settings = Settings(duration=0.1)
-    mesh = wc.TetForest.box(CELLS, CELL_SIZE, settings.level)
-    for case in cases(settings.level):
-        if isinstance(case.model, wc.Corotated):
-            assert case.model.subtrees
-            leafwise = replace(case.model, subtrees=False)
-            ended = [
-                follow(
-                    beam(mesh, model, settings, wp.get_device(device)), case, settings.samples, lambda *_: None
-                ).positions
-                for model in (case.model, leafwise)
-            ]
-            assert np.abs(ended[0] - mesh.points).max() > 0.01
-            assert np.abs(ended[1] - ended[0]).max() < 1e-6, case.name
-
-
 def test_rotations_within_a_tolerance_bring_the_end_where_own_ones_do(device):
     """Within 0.3 mm, at the bottom of the first swing and near rest; rotations of level 3 are 0.5 mm off."""
     settings = Settings(duration=1.0)
@@ -153,14 +119,6 @@ def test_every_stage_is_timed(device):
             assert min(times.force, times.rest, times.step, times.shipped) > 0
             assert (times.rotation > 0) == (run.case.rotation_level is not None)
         assert run.times.fused == (run.case.name == OWN)
-
-
-def test_progress_adds_up(device):
-    settings = Settings(duration=0.03, level=2, rounds=1)
-    told = []
-    run_experiment(settings, device=device, progress=lambda what, done: told.append((what, done)))
-    assert sum(done for _, done in told) == work(settings)
-    assert {what for what, _ in told} == {case.label for case in cases(2)} | {"timing the stages"}
 
 
 # --- what is written -----------------------------------------------------------------------------------------------
@@ -233,19 +191,3 @@ def test_bad_values_are_refused(arguments, says, tmp_path, capsys):
     assert command.main(["-o", str(tmp_path), *arguments]) == 2
     assert says in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
-
-
-def test_missing_matplotlib_is_said_before_the_run(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(figures, "find_spec", lambda name: None)
-    assert command.main(["-o", str(tmp_path)]) == 2
-    assert "warp-corot[plot]" in capsys.readouterr().err
-
-
-def test_a_failed_write_leaves_no_part(device, tmp_path, monkeypatch):
-    target = tmp_path / command.RESULTS
-    target.write_text("old")
-    monkeypatch.setattr("os.replace", lambda *args: (_ for _ in ()).throw(OSError(28, "No space left")))
-    with pytest.raises(OSError, match="No space"):
-        write_json(target, report.to_json(coarse(device)))
-    assert [f.name for f in tmp_path.iterdir()] == [target.name]
-    assert target.read_text(encoding="utf-8") == "old"

@@ -6,6 +6,7 @@ from dataclasses import replace
 import pytest
 
 from warp_corot.cli import main
+from warp_corot.cli.verify import write_json
 from warp_corot.experiments import CASES, Row, Setup, run_case
 
 
@@ -60,3 +61,11 @@ def test_cases_are_listed_and_unknown_ones_refused(capsys):
     assert capsys.readouterr().out.count("reference: ") == len(CASES)
     assert main(["verify", "slop", "--device", "cpu"]) == 2
     assert "did you mean slope" in capsys.readouterr().err
+
+
+def test_a_failed_write_leaves_no_part(tmp_path, monkeypatch):
+    (tmp_path / "rows.json").write_text("old")
+    monkeypatch.setattr("os.replace", lambda *args: (_ for _ in ()).throw(OSError(28, "No space left")))
+    with pytest.raises(OSError, match="No space"):
+        write_json(tmp_path / "rows.json", {"rows": []})
+    assert [(each.name, each.read_text()) for each in tmp_path.iterdir()] == [("rows.json", "old")]

@@ -1,32 +1,32 @@
-"""Soft bodies under their own weight with defaults: no error, no absurd state, and no energy beyond gravity's.
+"""Soft bodies under their own weight with defaults: no error, no absurd state, and no energy from nowhere.
 
-The bodies are in ``loaded``, the checks and their tolerances in ``falls``.
+The bodies are in ``loaded``; the checks, their tolerances, and bodies on which no constant was tuned in ``falls``.
 """
 
 import numpy as np
 import pytest
-from falls import Fall, fall, violations
-from loaded import DOZEN, FEW, GRAVITY, LAWS, LONG, MANY, SHAPES, SHORT, THIRTY, Loaded
+from falls import STRANGERS, Fall, fall, violations
+from loaded import DOZEN, FEW, GRAVITY, LONG, MANY, SHORT, THIRTY, Loaded
+
+#: Strangers with former or early trouble, and for how long [s].
+SOON = {
+    "liver, light": 0.5,
+    "hollow sphere, nu 0.3": 0.6,
+    "shaken, neo-Hookean": 0.8,
+    "thrown, neo-Hookean": 0.3,
+    "remeshed": 0.3,
+}
 
 
-@pytest.mark.parametrize("case", DOZEN, ids=str)
-def test_a_soft_body_moves_within_what_gravity_gives(case, device):
-    assert violations(fall(case, SHORT, FEW, device)) == []
+@pytest.mark.parametrize("case", [*DOZEN, *(case for case in STRANGERS if case.name in SOON)], ids=str)
+def test_a_soft_body_moves_within_what_it_was_given(case, device):
+    assert violations(fall(case, SOON.get(str(case), SHORT), FEW, device)) == []
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("case", THIRTY, ids=str)
-def test_a_soft_body_goes_on_moving_within_what_gravity_gives(case, device):
+@pytest.mark.parametrize("case", [*THIRTY, *STRANGERS], ids=str)
+def test_a_soft_body_goes_on_moving_within_what_it_was_given(case, device):
     assert violations(fall(case, LONG, MANY, device)) == []
-
-
-def test_all_shapes_laws_and_stiffnesses_are_among_them():
-    assert {case.shape for case in THIRTY} == set(SHAPES)
-    assert {case.law for case in THIRTY} == set(LAWS)
-    assert {case.kilopascals for case in THIRTY} == {1, 3, 5, 10, 30}
-    assert len(set(THIRTY)) == len(THIRTY) >= 30
-    assert len(set(DOZEN)) == len(DOZEN) == 12
-    assert {case.shape for case in DOZEN} == set(SHAPES)
 
 
 def test_stvk_that_collapses_says_why(device):
@@ -35,24 +35,18 @@ def test_stvk_that_collapses_says_why(device):
     assert not violations(found) or "barrier" in found.error
 
 
-# --- the laws see what they should ------------------------------------------------------------------------------------
-
-
 def drop(**changed):
     """A free fall of 2 kg over 1 s, with some of its numbers changed."""
-    t = np.linspace(0.1, 1.0, 10)
+    t = np.linspace(0.0, 1.0, 11)
     fallen = 0.5 * GRAVITY * t**2
     energy = 2 * GRAVITY * fallen
     numbers = {"times": t, "kinetic": energy, "elastic": 0 * t, "dropped": energy, "farthest": fallen}
-    return Fall(1, 10.0, 0.1, lengthens=False, **(numbers | changed))
-
-
-def test_a_free_fall_holds_all_laws():
-    assert violations(drop()) == []
+    return Fall(**({"length": 10.0, "softness": 0.1} | numbers | changed))
 
 
 def test_violations_are_seen():
-    late = np.arange(10) > 5  # from 0.7 s on
+    assert violations(drop()) == []
+    late = np.arange(11) > 6  # from 0.7 s on
     (said,) = violations(drop(kinetic=drop().kinetic * np.where(late, 1.02, 1.0)))
     assert "energy" in said
     assert "0.70 s" in said
@@ -62,11 +56,7 @@ def test_violations_are_seen():
     assert said == "not finite at 0.70 s"
     (said,) = violations(drop(error="the state is not finite"))
     assert said.startswith("ended")
-
-
-@pytest.mark.parametrize("law", ["corotated", "neo-hookean", "mass-spring"])
-def test_a_small_step_holds_all_laws(law, device):
-    """The checks are feasible: a tenth of the stable step at rest satisfies them."""
-    case = Loaded("sphere", 1, law)
-    dt = 0.1 * case.simulation(FEW, device).stable_dt
-    assert violations(fall(case, SHORT, FEW, device, dt)) == []
+    # What supports put in until they rest is given, and no more.
+    (said,) = violations(drop(begins=0.5, kinetic=drop().kinetic + 5.0 * late))
+    assert "energy" in said
+    assert violations(drop(begins=0.7, kinetic=drop().kinetic + 5.0 * late)) == []

@@ -72,6 +72,8 @@ CASES = [
     *((mesh, model) for mesh in ("adaptive", "general") for model in OTHERS),
 ]
 
+ON_CPU = [("adaptive", COROTATED[0]), ("adaptive", COROTATED[1]), ("general", COROTATED[0]), ("general", OTHERS[3])]
+
 
 def body_on(device, mesh, *, amount=0.0, worlds=1, followed=False):
     """A block fixed at x = 0, its other nodes displaced by up to ``amount`` of the shortest edge.
@@ -122,6 +124,8 @@ def assert_repeats(make, steps=200):
 @pytest.mark.parametrize(("mesh", "model"), CASES, ids=repr)
 def test_runs_repeat_bit_by_bit(mesh, model, device):
     """Each run finds its steps again, from the same forces."""
+    if device == "cpu" and (mesh, model) not in ON_CPU:
+        pytest.skip("sums are in one order for all laws there")
     assert_repeats(lambda: simulated(body_on(device, MESHES[mesh](), amount=0.1), model, deterministic=True))
 
 

@@ -11,15 +11,6 @@ def box():
     return wc.TetForest.box(cells=(1, 1, 2), cell_size=0.1, level=5)
 
 
-def open_edges(triangles, points):
-    """Edges that have no other triangle on their other side, points in one place taken as one."""
-    places = np.unique(np.round(points, 9), axis=0, return_inverse=True)[1].ravel()[triangles]
-    places = places[(places != np.roll(places, 1, axis=1)).all(axis=1)]
-    edges = np.concatenate([places[:, [k, (k + 1) % 3]] for k in range(3)])
-    both, count = np.unique(np.concatenate([edges, edges[:, ::-1]]), axis=0, return_counts=True)
-    return int((count % 2 > 0).sum()), both
-
-
 @pytest.mark.parametrize("axis", [0, 1, 2])
 @pytest.mark.parametrize("flipped", [False, True])
 def test_what_is_left_is_closed_and_as_large_as_it_should_be(axis, flipped):
