@@ -49,13 +49,19 @@ const auto sum = [&](const four* v, int begin, int end) {
     a += b + c;
     return four{a[0], a[1], a[2], 0.0f};
 };
-// The same with contacts: below the diagonal, and above it.
+// The same with contacts: below the diagonal, and above it. Where levels have several pieces, rows are not swept over in
+// the order of their numbers.
+const auto comes_after = [&](int column, int i) {
+    const int* span = division.spans_of.data;
+    const int difference = shares_rows ? span[column] / per_team - span[i] / per_team : 0;
+    return difference == 0 ? column > i : difference > 0;
+};
 const int* heads = &of_contacts.heads.data[first];
 const bool touches = of_contacts.count.data[0] > 0;
 const auto with_contacts = [&](four a, const four* v, int i, bool is_above) {
     for (int e = touches ? heads[i] : -1; e >= 0; e = of_contacts.next.data[e]) {
         const int column = of_contacts.columns.data[e];
-        if ((column > i) == is_above) a += times(&of_contacts.blocks.data[e].data[0][0], v[column]);
+        if (comes_after(column, i) == is_above) a += times(&of_contacts.blocks.data[e].data[0][0], v[column]);
     }
     return a;
 };

@@ -239,6 +239,28 @@ def test_implicit_steps_do_not_depend_on_the_number_of_threads(poisson, lies, to
     assert four < 1.2 * one
 
 
+def pressed_together(threads):
+    """A plate presses a block onto another one, whose rows are of other levels."""
+    lower = wc.TetForest.box((2, 1, 2), 0.03, 8)
+    upper = wc.TetForest.box((2, 1, 2), 0.028, 8, origin=(0.002, 0.0305, 0.002))
+    material = wc.Isotropic(5e3, 0.44, 1000.0)
+    bodies = [wc.SoftBody(mesh, material, device="cpu", threads=threads) for mesh in (lower, upper)]
+    bodies[0].fix("y < ymin + 1e-6")
+    plate = wc.Tool(wc.Box((0.1, 0.01, 0.1), position=(0.03, 0.0645, 0.03)))
+    plate.follow([0.0, 0.1], [(0.03, 0.0645, 0.03), (0.03, 0.058, 0.03)])
+    contact, steps = wc.Contact(friction=0.3), wc.BackwardEuler(dt=1 / 60)
+    sim = wc.Simulation(bodies, integrator=steps, obstacles=[plate], contact=contact)
+    sim.advance_steps(4)
+    return sim, bodies[1].positions.numpy()
+
+
+def test_bodies_that_touch_are_solved_for_by_several_threads():
+    (one, alone), (two, shared) = pressed_together(1), pressed_together(2)
+    assert one.solves.unfinished == two.solves.unfinished == 0
+    assert two.solves.linear_iterations < 1.3 * one.solves.linear_iterations
+    np.testing.assert_allclose(shared, alone, atol=2e-6)
+
+
 @pytest.mark.parametrize("poisson", [0.3, 0.49])
 @pytest.mark.parametrize("integrator", [None, wc.BackwardEuler(dt=0.01)])
 def test_threads_take_whole_worlds_each_of_which_moves_as_it_would_alone(poisson, integrator):
