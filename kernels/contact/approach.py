@@ -17,7 +17,6 @@ from .explicit_step import push
 from .mass_split import Sums, take_force
 from .motion import Bearing, Foreseen, Motions, Surface, distance_between, foreseen, kick_of
 from .shapes import GROUND, distance_to, sure_distance
-from .touches import Touches
 from .vertices import FORESEEN, OUT, Rigid
 from .visits import LATE, LISTED, Part, Visits, append, choose, claim, lower_budget
 from .watch import FAR, FARTHEST, STABLE, Near, Watch, begin_obstacle, pair_of
@@ -57,7 +56,7 @@ def begin_visits(
     pace: Pace,
     world_starts: wp.array[wp.float64],
     offset: int,
-    touches: Touches,
+    rigid: Rigid,
     # In and out
     watch: Watch,
     here: Near,
@@ -72,9 +71,8 @@ def begin_visits(
     kept = int(0)
     for k in range(here.touch_count[0]):
         pair = here.touches[k]
-        force = touches.force[pair // touches.force.shape[1], pair % touches.force.shape[1]]
         # A triangle with a force is found again, wherever it is now.
-        if wp.length_sq(force) > 0.0:
+        if wp.length_sq(rigid.rows.force[rigid.first_triangle + pair]) > 0.0:
             here.touches[kept] = pair
             kept += 1
         else:
@@ -279,7 +277,8 @@ def room_beside(s: int, has_edges: int, part: Part, rigid: Rigid, watch: Watch, 
     may_touch = bool(False)
     farthest = FARTHEST * watch.size
     room = float(farthest)
-    for o in range(rigid.forces.shape[0]):
+    for o in range(rigid.shapes.kind.shape[0]):
+        r = o * surface.node.shape[0] + s
         span = float(0.0)
         if has_edges != 0 and rigid.shapes.kind[o] != GROUND:
             span = LONG * visits.spans[s]
@@ -287,10 +286,10 @@ def room_beside(s: int, has_edges: int, part: Part, rigid: Rigid, watch: Watch, 
         distance, _n = distance_to(rigid.shapes, o, pose, x, room + span + rigid.law.tolerance)
         gap = sure_distance(rigid.shapes, o, distance) - rigid.law.tolerance
         # A place that could act in the last step is found once more.
-        holds = rigid.allowance[o, s] != 0.0 or wp.length_sq(rigid.forces[o, s]) > 0.0
-        if gap <= close or rigid.acts[o, s] != OUT or holds:
+        holds = rigid.allowance[r] != 0.0 or wp.length_sq(rigid.rows.force[r]) > 0.0
+        if gap <= close or rigid.rows.acts[r] != OUT or holds:
             may_touch = True
-            append(visits.contacts, 0, visits.contact_count, 0, o * surface.node.shape[0] + s, visits.is_shared)
+            append(visits.contacts, 0, visits.contact_count, 0, r, visits.is_shared)
         if holds:
             gap = wp.min(gap, 0.0)
         elif gap < -watch.least[0] and (here.flags[s] & LATE) != 0 and visits.may_miss[0] != 0:

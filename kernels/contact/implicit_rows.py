@@ -19,7 +19,6 @@ from .contact_curvature import Rolling, share_of_moment, tilted
 from .motion import Surface
 from .rows import Rows, row_count
 from .springs import bound_of, spring_state
-from .touches import Touches
 
 wp.set_module_options({"enable_backward": False})
 
@@ -509,41 +508,43 @@ def keep_pair_forces(threads: int, rows: ImplicitRows, pairs: Rows, searches: wp
         k += threads
 
 
+@wp.func
+def end_row(r: int, own: int, force: wp.vec3, rows: ImplicitRows, kept: Rows):
+    """Keep a row of obstacles or a pair, by its number there, for the next step."""
+    kept.force[own] = force
+    kept.acts[own] = int(wp.length_sq(force) > 0.0)
+    if r >= rows.first_triangle and r < rows.first_pair and rows.listed[r] != 0:
+        kept.weights[own] = rows.weights[r]
+        kept.normal[own] = rows.normal[r]
+        kept.gap[own] = rows.gap[r]
+
+
 @wp.kernel(enable_backward=False)
 def end_rows(
     # In
     threads: int,
     rows: ImplicitRows,
     # Out
-    forces: wp.array2d[wp.vec3],
-    touches: Touches,
+    beside: Rows,
     pairs: Rows,
     added: wp.array[wp.vec3],
 ):
-    """Keep forces for the next step, and where they are, and gather them at places, held ones too."""
+    """Keep forces for the next step, and where they are, and gather them at places, held ones too.
+
+    Args:
+        beside: The rows of obstacles.
+    """
     r = wp.tid()
-    count = rows.first_pair + row_count(pairs)
-    while r < count:
+    while r < rows.first_pair + row_count(pairs):
         force = wp.vec3()
         if rows.listed[r] != 0:
             force = rows.force[r]
-        acts = int(wp.length_sq(force) > 0.0)
-        w = rows.weights[r]
-        if r < rows.first_triangle:
-            forces[r / forces.shape[1], r % forces.shape[1]] = force
-        elif r < rows.first_pair:
-            o = (r - rows.first_triangle) / touches.force.shape[1]
-            t = (r - rows.first_triangle) % touches.force.shape[1]
-            touches.force[o, t] = force
-            touches.acts[o, t] = acts
-            if rows.listed[r] != 0:
-                touches.shares[o, t] = corner_weights(r, rows)
-                touches.normal[o, t] = rows.normal[r]
-                touches.gap[o, t] = rows.gap[r]
+        if r < rows.first_pair:
+            end_row(r, r, force, rows, beside)
         else:
-            pairs.force[r - rows.first_pair] = force
-            pairs.acts[r - rows.first_pair] = acts
-        if acts != 0:
+            end_row(r, r - rows.first_pair, force, rows, pairs)
+        if wp.length_sq(force) > 0.0:
+            w = rows.weights[r]
             for k in range(4):
                 if w[k] != 0.0:
                     wp.atomic_add(added, rows.places[r][k], w[k] * force)

@@ -101,7 +101,7 @@ def find_pair_onsets(
         force = rows.force[row]
         if wp.dot(force, force) == 0.0 and locate_facing(row, surface, meeting, rows):
             p = rows.places[row]
-            w = rows.shares[row]
+            w = rows.weights[row]
             closing = wp.vec3()
             for k in range(4):
                 closing += w[k] * surface.d[p[k]]

@@ -98,7 +98,7 @@ def locate(
     # For pairs that are located again before the first solve.
     rows.force[r] = wp.where(which != AGAIN, was, wp.vec3())
     p = pairs.places[k]
-    w = pairs.shares[k]
+    w = pairs.weights[k]
     is_free = bool(False)
     given = wp.vec3()
     if is_near:

@@ -21,22 +21,6 @@ BLUR = wp.constant(1.0e-3)
 SKEWERED = wp.constant(0.25)
 
 
-@wp.struct
-class Touches:
-    """Obstacles at triangles, [O, T]."""
-
-    shares: wp.array2d[wp.vec3]  # weights of the corners at the contact point; zero if nothing is near
-    normal: wp.array2d[wp.vec3]  # from the obstacle to the triangle
-    gap: wp.array2d[wp.float32]
-    friction: wp.array2d[wp.float32]
-    moved: wp.array2d[wp.vec3]  # motion of the obstacle's point in this step [m]
-    acts: wp.array2d[wp.int32]  # see ``mass_split``
-    force: wp.array2d[wp.vec3]  # on the triangle [N]
-    more: wp.array2d[wp.vec3]  # its change in the last iteration
-    warmth: wp.array[wp.float32]  # [T] fraction of the last step's normal force that is left beside corners that touch
-    allowance: wp.array2d[wp.float32]  # how deep the triangle may be [m]; see ``law.allowed``
-
-
 @wp.func
 def nearest(shapes: Shapes, o: int, pose: wp.transform, most: float, far: float, a: wp.vec3, b: wp.vec3, c: wp.vec3):
     """Weights of the corners at the closest point, the gap there, and the direction out of the obstacle; any point if
@@ -64,61 +48,86 @@ def nearest(shapes: Shapes, o: int, pose: wp.transform, most: float, far: float,
 
 
 @wp.func
-def find_touch(o: int, t: int, rigid: Rigid, triangles: wp.array[wp.vec3i], touches: Touches):
+def near_triangle(
+    o: int,
+    pose: wp.transform,
+    a: wp.vec3,
+    b: wp.vec3,
+    c: wp.vec3,
+    far: float,
+    was: wp.vec3,
+    side: wp.vec3,
+    shapes: Shapes,
+):
+    """Whether an obstacle comes within reach of a triangle, but not of its corners; the weights of the corners at the
+    closest point, the gap there, and the direction out of the obstacle.
+
+    Args:
+        was, side: The last force and normal.
+    """
+    middle = (a + b + c) / 3.0
+    most = far + wp.max(wp.length(a - middle), wp.max(wp.length(b - middle), wp.length(c - middle)))
+    distance, n = distance_to(shapes, o, pose, middle, most)
+    if distance > most:
+        return False, wp.vec3(), distance, n
+    w, gap, out = nearest(shapes, o, pose, most, far, a, b, c)
+    if wp.dot(was, was) > 0.0 and wp.dot(out, side) < 0.0 and shapes.kind[o] == CAPSULE:
+        # The axis has passed through since the last time.
+        out = -out
+        gap = -2.0 * shapes.size[o][0] - gap
+    return gap <= far and wp.max(w) <= CORNER, w, gap, out
+
+
+@wp.func
+def find_touch(r: int, rigid: Rigid, triangles: wp.array[wp.vec3i]):
     """Find the point where an obstacle comes close to a triangle but not to its corners, and the force with which the
     step begins. Returns whether there is one.
     """
-    was = touches.force[o, t]
-    side = touches.normal[o, t]
+    rows = rigid.rows
+    o = (r - rigid.first_triangle) // triangles.shape[0]
+    t = (r - rigid.first_triangle) % triangles.shape[0]
+    was = rows.force[r]
     # Most triangles that something is near have no contact: these are only read.
-    if wp.length_sq(touches.shares[o, t]) > 0.0 or wp.dot(was, was) > 0.0:
-        touches.shares[o, t] = wp.vec3()
-        touches.force[o, t] = wp.vec3()
-        touches.more[o, t] = wp.vec3()
-        touches.acts[o, t] = 0
+    if wp.length_sq(rows.weights[r]) > 0.0 or wp.dot(was, was) > 0.0:
+        rows.weights[r] = wp.vec4()
+        rows.force[r] = wp.vec3()
+        rows.more[r] = wp.vec3()
+        rows.acts[r] = 0
     corners = triangles[t]
     pose = rigid.motions.now[rigid.surface.world[corners[0]], o]
     later = rigid.motions.later[rigid.surface.world[corners[0]], o]
     a = rigid.surface.x[corners[0]]
     b = rigid.surface.x[corners[1]]
     c = rigid.surface.x[corners[2]]
-    middle = (a + b + c) / 3.0
-    size = wp.max(wp.length(a - middle), wp.max(wp.length(b - middle), wp.length(c - middle)))
     far = wp.max(
         wp.length(rigid.surface.d[corners[0]]),
         wp.max(wp.length(rigid.surface.d[corners[1]]), wp.length(rigid.surface.d[corners[2]])),
     )
-    far = FORESEEN * (far + wp.length(carried(pose, later, middle))) + rigid.law.tolerance
-    distance, _away = distance_to(rigid.shapes, o, pose, middle, size + far)
-    if distance > size + far:
+    far = FORESEEN * (far + wp.length(carried(pose, later, (a + b + c) / 3.0))) + rigid.law.tolerance
+    is_near, w, gap, n = near_triangle(o, pose, a, b, c, far, was, rows.normal[r], rigid.shapes)
+    if not is_near:
         return False
-    w, gap, n = nearest(rigid.shapes, o, pose, size + far, far, a, b, c)
-    if wp.dot(was, was) > 0.0 and wp.dot(n, side) < 0.0 and rigid.shapes.kind[o] == CAPSULE:
-        # The axis has passed through since the last step.
-        n = -n
-        gap = -2.0 * rigid.shapes.size[o][0] - gap
-    if gap > far or wp.max(w) > CORNER:
-        return False
-    allowance = touches.allowance[o, t]
+    allowance = rigid.allowance[r]
     if allowance != 0.0:
         allowance = allowed(allowance, gap)
-        touches.allowance[o, t] = (1.0 - LOST) * allowance
+        rigid.allowance[r] = (1.0 - LOST) * allowance
         gap += allowance
         if gap > far:
             return False
     friction = wp.where(gap < -SKEWERED * rigid.shapes.thickness[o], 0.0, rigid.shapes.friction[o])
-    touches.shares[o, t] = w
-    touches.normal[o, t] = n
-    touches.gap[o, t] = gap
-    touches.friction[o, t] = friction
-    touches.moved[o, t] = carried(pose, later, point_of(w, a, b, c))
+    rows.weights[r] = wp.vec4(w[0], w[1], w[2], 0.0)
+    rows.normal[r] = n
+    rows.gap[r] = gap
+    rows.friction[r] = friction
+    rows.moved[r] = carried(pose, later, point_of(w, a, b, c))
     was_push = wp.max(wp.dot(was, n), 0.0)
     push = was_push
     # Beside corners that touch, too, it would hold these off; and where nodes bear places, other places.
     for k in range(3):
-        if rigid.anchors[o, corners[k]][3] > 0.0 or is_borne(corners[k], rigid.surface):
-            push = touches.warmth[t] * was_push
+        at = rigid.anchors[o * rigid.surface.node.shape[0] + corners[k]]
+        if at[3] > 0.0 or is_borne(corners[k], rigid.surface):
+            push = rigid.warmth[t] * was_push
     # Friction begins with all of it, because the slip that restores a part would accumulate.
     if push > 0.0:
-        touches.force[o, t] = push * n + held_back(across(was, n), was_push, friction)
+        rows.force[r] = push * n + held_back(across(was, n), was_push, friction)
     return True

@@ -16,7 +16,6 @@ from warp_corot.kernels.contact.motion import Surface
 from warp_corot.kernels.contact.obstacle_rows import locate_obstacles
 from warp_corot.kernels.contact.pair_rows import find_strays, locate_pairs
 from warp_corot.kernels.contact.rows import Meeting, Rows
-from warp_corot.kernels.contact.touches import Touches
 from warp_corot.kernels.implicit.assembled import Couplings
 from warp_corot.solvers.implicit.operator import Springs
 from warp_corot.solvers.system import System
@@ -282,11 +281,9 @@ class ImplicitContact:
 
     def launch_end(self, d: wp.array) -> None:
         """Launch the update of what users read about contact, and of whether a new search is due."""
-        surface, forces, touches = self._surface, self._zeros((0, 0), wp.vec3), Touches()
-        if self._rigid is not None:
-            forces, touches = self._rigid.forces, self._rigid.touches
+        surface, beside = self._surface, Rows() if self._rigid is None else self._rigid.rows
         self.update(d)
-        self._launch(kernels.end_rows, self._length, [self._rows, forces, touches, self._of_pairs[1], self._added])
+        self._launch(kernels.end_rows, self._length, [self._rows, beside, self._of_pairs[1], self._added])
         inputs = [d, self._carriers, self._added, surface.arrays]
         wp.launch(kernels.end_places, surface.count, inputs, device=self.device)
         for k, body in enumerate(self._system.bodies):
@@ -327,7 +324,7 @@ class ImplicitContact:
         assert self._rigid is not None
         surface, rigid, obstacles, pace = self._surface, self._rigid, self._obstacles, self._system.pace.arrays
         inputs = [int(which), obstacles.shapes, obstacles.motions, self._law, pace, surface.arrays]
-        inputs += [surface.triangles, d, rigid.forces, rigid.touches, going, self._carriers, self._rows, self.changed]
+        inputs += [surface.triangles, d, rigid.rows, going, self._carriers, self._rows, self.changed]
         self._launch(locate_obstacles, self._items, inputs, most=self._items)
 
     @property

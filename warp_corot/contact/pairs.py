@@ -15,6 +15,7 @@ from warp_corot.kernels.contact.search import pair_finder
 from warp_corot.kernels.contact.watch import HIT
 from warp_corot.solvers.halo import ALONE, Halo
 
+from .obstacles import rows_of
 from .options import Contact
 from .search import Search
 from .surface import ContactSurface
@@ -113,17 +114,15 @@ class Pairs:
 
     def _rows_for(self, room: int) -> tuple[Rows, OldRows]:
         device, owners = self.device, self.surface.count + self.surface.edge_count
-        rows, old = Rows(), OldRows()
+        rows, old = rows_of(room, device), OldRows()
+        rows.friction.fill_(self.friction)
         rows.total = wp.zeros(1, dtype=wp.int32, device=device)
         for kept in (rows, old):
             kept.starts, kept.counts = (wp.zeros(owners, dtype=wp.int32, device=device) for _ in range(2))
-            kept.other, kept.acts = (wp.zeros(room, dtype=wp.int32, device=device) for _ in range(2))
-            kept.force = wp.zeros(room, dtype=wp.vec3, device=device)
+            kept.other = wp.zeros(room, dtype=wp.int32, device=device)
+        old.acts, old.force = wp.zeros_like(rows.acts), wp.zeros_like(rows.force)
         rows.owner = wp.zeros(room, dtype=wp.int32, device=device)
-        rows.normal, rows.more = (wp.zeros(room, dtype=wp.vec3, device=device) for _ in range(2))
         rows.places = wp.zeros(room, dtype=wp.vec4i, device=device)
-        rows.shares = wp.zeros(room, dtype=wp.vec4, device=device)
-        rows.gap = wp.zeros(room, dtype=wp.float32, device=device)
         rows.away = wp.zeros(room if device.is_cpu else 0, dtype=wp.float32, device=device)
         return rows, old
 

@@ -12,7 +12,6 @@ from warp_corot.errors import UnstableError
 from warp_corot.kernels.contact import beside
 from warp_corot.kernels.contact import sleep as sleeping
 from warp_corot.kernels.contact import watch as kernels
-from warp_corot.kernels.contact.touches import Touches
 from warp_corot.kernels.contact.vertices import Rigid
 from warp_corot.solvers.pace import Mapped
 
@@ -216,15 +215,15 @@ class Search:
 
     def _launch(self, first: int, last: int, asks: int, sleeps: bool) -> None:
         """Launch phases of a search."""
-        rigid, touches, triangles, threads = Rigid(), Touches(), 0, 1
+        rigid, triangles, threads = Rigid(), 0, 1
         rigid.surface, rigid.motions = self.surface.arrays, self.obstacles.motions
         if self.rigid is not None:
-            rigid, touches, triangles = self.rigid.arrays, self.rigid.touches, self.rigid.touches.force.size
+            rigid, triangles = self.rigid.arrays, self.rigid.touch_count
         if self.device.is_cuda:
             blocks = -(-max(self.surface.count + triangles, self.watch.poses.size) // BLOCK)
             threads = BLOCK * min(max(blocks, 1), BLOCKS_EACH * self.device.sm_count)
         inputs = [threads, int(first), int(last), asks, int(sleeps), self.surface.triangles]
-        outputs = [rigid, self.watch, self.near, touches, self._arrived]
+        outputs = [rigid, self.watch, self.near, self._arrived]
         wp.launch(beside.search_near, threads, inputs, outputs, device=self.device, block_dim=min(threads, BLOCK))
 
     def _on_nodes(self, kernel: wp.Kernel, inputs: list) -> None:
