@@ -4,10 +4,8 @@ import warp as wp
 
 from warp_corot.kernels.stepping.threads import spread_thread, synchronize_grid
 
-from .boxes import raise_by_warp
+from .explicit_rows import Rigid
 from .shapes import GROUND, distance_to, sure_distance
-from .sleep import end_search
-from .vertices import Rigid
 from .watch import (
     AROUND,
     ASKED,
@@ -18,10 +16,12 @@ from .watch import (
     add_motion,
     begin_search,
     end_asking,
+    end_search,
     fastest_motion,
     leave_room,
     mark,
 )
+from .wide_tree import raise_by_warp
 
 wp.set_module_options({"enable_backward": False})
 

@@ -1,7 +1,7 @@
 """All contacts of an implicit step as one table of rows, and what a step asks of them.
 
 A row is an obstacle at a place, an obstacle at a triangle, or a pair of soft surfaces: up to four places with weights,
-whose weighted motion opens it. Nodes bear a place, or it is a node itself. See ``springs`` for a row's force, with a
+whose weighted motion opens it. Nodes bear a place, or it is a node itself. See ``law`` for a row's force, with a
 stiffness like that of the nodes around it. Each time the step has been solved for, rows are located again and their
 forces become their multipliers; see ``obstacle_rows`` and ``pair_rows``. While the step is solved for, a row stays what
 it was located as, a plane that nothing passes.
@@ -13,12 +13,21 @@ from warp_corot.kernels.elements.elements import load_node, store_node
 from warp_corot.kernels.implicit.assembled import Couplings, add_block, begin_coupling, end_coupling, root_columns
 from warp_corot.kernels.implicit.line_search import TRIED
 
-from .bearing import is_borne, loose_at, loose_part
-from .carriers import Carriers, couple_at, ease_at, mark_carriers, motion_at, push_at
-from .contact_curvature import Rolling, share_of_moment, tilted
+from .bearing import (
+    Carriers,
+    couple_at,
+    ease_at,
+    is_borne,
+    loose_at,
+    loose_part,
+    mark_carriers,
+    motion_at,
+    push_at,
+)
+from .closest import Rolling, share_of_moment, tilted
+from .law import bound_of, spring_state
 from .motion import Surface
 from .rows import Rows, row_count
-from .springs import bound_of, spring_state
 
 wp.set_module_options({"enable_backward": False})
 

@@ -4,10 +4,10 @@ import warp as wp
 
 from .bearing import is_borne
 from .closest import on_segments, on_triangle, point_of
-from .law import Law, held_back
+from .explicit_rows import FORESEEN
+from .law import Law, across, held_back
 from .motion import Surface
 from .rows import BAND, BAND_AT_REST, BAND_OF_NEIGHBOURS, Meeting, Rows, triangle_normal
-from .vertices import FORESEEN, across
 
 wp.set_module_options({"enable_backward": False})
 

@@ -22,12 +22,11 @@ from warp_corot.kernels.stepping.pace import DT, Pace
 from warp_corot.kernels.stepping.threads import spread_thread, synchronize_blocks, synchronize_grid
 
 from .bearing import MOSTLY, is_borne, left_between, loose_share
-from .law import Law, held_back, least_motion, left_to_held
+from .explicit_rows import ACTS, BEGINS, ENDS, OUT, WAITS, Rigid, anchor, begin_place, find_touch
+from .law import Law, across, held_back, least_motion, left_to_held
 from .locate import list_by_warp, locate_row
 from .motion import Surface
 from .rows import Meeting, Rows, row_count
-from .touches import find_touch
-from .vertices import ACTS, BEGINS, ENDS, OUT, WAITS, Rigid, across, anchor, begin_place
 from .watch import BESIDE, Near
 
 wp.set_module_options({"enable_backward": False})

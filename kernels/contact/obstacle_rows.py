@@ -4,17 +4,14 @@ import warp as wp
 
 from warp_corot.kernels.stepping.pace import DT, Pace
 
-from .bearing import is_borne, left_at
-from .carriers import Carriers, crowd_at, is_held_at, motion_at
-from .contact_curvature import Rolling, rolling_of, tilted
+from .bearing import Carriers, crowd_at, is_borne, is_held_at, left_at, motion_at
+from .closest import Rolling, rolling_of, tilted
+from .explicit_rows import CORNER, SKEWERED, near_triangle
 from .implicit_rows import AGAIN, FIRST, MISSING, ImplicitRows, corner_weights, list_row
-from .law import Law, held_back
+from .law import QUARTERED, Law, across, held_back, kept_gap
 from .motion import Motions, Surface
 from .rows import Rows
 from .shapes import CAPSULE, GROUND, SPHERE, Shapes, carried, distance_to
-from .springs import QUARTERED, kept_gap
-from .touches import CORNER, SKEWERED, near_triangle
-from .vertices import across
 
 wp.set_module_options({"enable_backward": False})
 

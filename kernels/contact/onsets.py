@@ -5,7 +5,7 @@ import warp as wp
 from warp_corot.kernels.elements.elements import load_node
 from warp_corot.kernels.stepping.pace import DT, Pace
 
-from .carriers import Carriers, is_held_at
+from .bearing import Carriers, is_held_at
 from .law import Law
 from .locate import locate_facing
 from .motion import Motions, Surface

@@ -4,11 +4,11 @@ import warp as wp
 
 from warp_corot.kernels.stepping.balance import sum_of_lanes
 
+from .explicit_rows import Rigid
 from .mass_split import force_of, grains_of
 from .motion import Motions, Surface
 from .rows import Rows, row_count
 from .shapes import Shapes, distance_to
-from .vertices import Rigid
 
 wp.set_module_options({"enable_backward": False})
 
@@ -142,19 +142,6 @@ def measure_gaps(
     gap, normal = distance_to(shapes, obstacles[i], poses[worlds[i], obstacles[i]], points[i, k], most)
     gaps[i, k] = gap
     normals[i, k] = normal
-
-
-@wp.kernel(enable_backward=False)
-def find_depths(shapes: Shapes, motions: Motions, surface: Surface, depths: wp.array[wp.float32]):
-    """Find the depth of each node inside obstacles [m], zero outside."""
-    s = wp.tid()
-    if surface.node[s] < 0 or surface.yielding[s] == 0.0:
-        return
-    deepest = float(0.0)
-    for o in range(shapes.kind.shape[0]):
-        gap, _n = distance_to(shapes, o, motions.later[surface.world[s], o], surface.x[s], 1.0e-3)
-        deepest = wp.max(deepest, -gap)
-    depths[s] = deepest
 
 
 @wp.kernel(enable_backward=False)

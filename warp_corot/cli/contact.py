@@ -9,13 +9,13 @@ import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
 from warp_corot.contact.options import Contact, checked_friction
-from warp_corot.contact.shapes import Box, Capsule, Cylinder, Ground, Shape, Sphere
+from warp_corot.contact.shapes import Box, Capsule, Cylinder, Ground, Shape, Sphere, axis_of
 from warp_corot.contact.skin import own_surface
 from warp_corot.contact.tool import Obstacle, Tool
 from warp_corot.cutting.blade import Blade
@@ -160,8 +160,6 @@ def _named_columns(row: list[str], path: Path) -> dict[str, float]:
 
 # --- what the bodies touch -------------------------------------------------------------------------------------------
 
-#: Overlaps below this fraction of a body's height are rounding and are not reported.
-SMALL = 1e-5
 #: Tetrahedra that reach farther than this beyond the surface, relative to the height of the body, are said.
 FAR = 0.01
 
@@ -284,41 +282,10 @@ def say_reach(bodies: Sequence[RunBody], sim: Simulation) -> None:
             )
 
 
-def say_overlaps(touched: RunContact, bodies: Sequence[RunBody], sim: Simulation) -> None:
-    """Add a note for each body on the obstacles that it overlaps before the run begins."""
-    if sim.contact is None or not touched.obstacles:
-        return
-    obstacles = sim.contact.obstacles
-    for body, part in zip(bodies, sim.contact.surface.parts, strict=True):
-        own = part.skin.own
-        at = body.soft.mesh.points[body.subject.used] if own is None else own.points
-        deepest = -obstacles.gaps(at, float(body.subject.height)).min(axis=1)
-        poses = obstacles.poses()[0]
-        for (name, each), depth, pose in zip(touched.obstacles.items(), deepest, poses, strict=True):
-            where = f"{name} starts {length(float(depth))} deep in the body"
-            if depth <= SMALL * body.subject.height:
-                if isinstance(each, Ground) or not _holds_axis(body.soft.mesh, each, pose):
-                    continue
-                where = f"{name} starts in the body"
-            body.subject.notes.append(f"{where}; they are pushed apart gently")
-
-
-def _holds_axis(mesh: Any, obstacle: Obstacle, pose: Floats) -> bool:
-    """Whether a mesh contains a point of an obstacle's axis, which may lie between its nodes."""
-    shape = obstacle.shape if isinstance(obstacle, Tool) else obstacle
-    half = shape.size[1] if isinstance(shape, Capsule | Cylinder) else 0.0
-    x, y, z, w = pose[3:]
-    axis = np.array([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)])
-    places = pose[:3] + np.linspace(-half, half, 33)[:, None] * axis
-    return bool((mesh.embed(places)[1] >= 0.0).all(axis=1).any())
-
-
 def _described(obstacle: Obstacle) -> str:
     shape = obstacle.shape if isinstance(obstacle, Tool) else obstacle
     if isinstance(shape, Ground):
-        x, y, z, w = shape.quaternion
-        normal = np.array([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)])
-        return f"at {float(normal @ shape.position) + 0.0:.4g} m"
+        return f"at {float(axis_of(shape.quaternion) @ shape.position) + 0.0:.4g} m"
     moves = isinstance(obstacle, Tool) and obstacle.keys is not None
     sizes = ", ".join(length(size) for size in shape.size if size > 0.0)
     return f"{shape!r} ({sizes}), {'moves along its path' if moves else 'stays where it is'}"

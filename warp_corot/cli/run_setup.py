@@ -24,7 +24,7 @@ from warp_corot.simulation.static import solve_static
 from warp_corot.solvers import INTEGRATORS, BackwardEuler, Integrator, QuasiStatic, SymplecticEuler
 
 from .bodies import RunBody, asked_bodies, find_body, find_patches, gravity_of, make_body
-from .contact import RunContact, make_blade, place_ground, say_overlaps, say_reach, touched_by
+from .contact import RunContact, make_blade, place_ground, say_reach, touched_by
 from .options import IMPLICIT_DT, integrator_name, is_static
 from .patches import press_patches, ramp_of
 from .results import Probe
@@ -104,7 +104,6 @@ def _made_ready(options: Sequence[argparse.Namespace], touches: bool, chooses: b
         choose_steps(shared, bodies, touched, device)
     with waiting("preparing the simulation"):
         sim = make_simulation(shared, bodies, touched)
-        say_overlaps(touched, bodies, sim)
         say_reach(bodies, sim)
     for body in bodies:
         press_patches(sim, body.soft, body.loads, body.patches, ramp_of(shared, duration))

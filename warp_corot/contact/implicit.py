@@ -8,9 +8,8 @@ import numpy as np
 import warp as wp
 
 from warp_corot.kernels.contact import bearing, onsets
-from warp_corot.kernels.contact import carriers as of_carriers
 from warp_corot.kernels.contact import implicit_rows as kernels
-from warp_corot.kernels.contact.contact_curvature import Rolling
+from warp_corot.kernels.contact.closest import Rolling
 from warp_corot.kernels.contact.law import Law
 from warp_corot.kernels.contact.motion import Surface
 from warp_corot.kernels.contact.obstacle_rows import locate_obstacles
@@ -104,7 +103,7 @@ class ImplicitContact:
         for fields, size in ((OF_ROWS, self._length), (OF_TRIANGLES, triangles), (OF_PAIRS, room)):
             for name, dtype in fields.items():
                 setattr(rows, name, self._zeros(size, dtype))
-        self._carriers = of_carriers.Carriers()
+        self._carriers = bearing.Carriers()
         for name, dtype in {"entry": wp.int32, "compliance": wp.float32, "gone": wp.vec3}.items():
             setattr(self._carriers, name, self._zeros(carriers, dtype))
         self._carriers.crowd = self._zeros((2, carriers), wp.float32)
@@ -192,7 +191,7 @@ class ImplicitContact:
         start, offset, count, own = self._nodes_of(k)
         inputs = [start, offset, first, body.conditions.inverse_mass, blocks]
         inputs += [body.state.rest, body.state.displacements, increment, guess]
-        wp.launch(of_carriers.begin_carriers, count, inputs, [own, self._carriers], device=self.device)
+        wp.launch(bearing.begin_carriers, count, inputs, [own, self._carriers], device=self.device)
         self._launch_places(k)
 
     def launch_first(self, offset: int, d: wp.array) -> None:
@@ -289,7 +288,7 @@ class ImplicitContact:
         for k, body in enumerate(self._system.bodies):
             start, _, count, own = self._nodes_of(k)
             inputs = [start, int(surface.parts[k].bearers > 0), own, surface.arrays]
-            wp.launch(of_carriers.end_carriers, count, inputs, [body.state.contact_forces], device=self.device)
+            wp.launch(bearing.end_carriers, count, inputs, [body.state.contact_forces], device=self.device)
         if self._pairs is not None:
             self._pairs.search.launch_after()
 

@@ -10,10 +10,10 @@ import warp as wp
 from warp_corot.inputs.cpu_threads import Regions, Team, launch
 from warp_corot.kernels.contact import approach, nearing, sums
 from warp_corot.kernels.contact import mass_split as kernels
+from warp_corot.kernels.contact.approach import Part, Visits
+from warp_corot.kernels.contact.explicit_rows import Rigid
 from warp_corot.kernels.contact.law import Law
 from warp_corot.kernels.contact.rows import Meeting, Rows
-from warp_corot.kernels.contact.vertices import Rigid
-from warp_corot.kernels.contact.visits import Part, Visits
 from warp_corot.kernels.contact.watch import Near
 from warp_corot.kernels.stepping.pace import Pace
 from warp_corot.kernels.stepping.threads import LINE

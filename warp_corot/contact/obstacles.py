@@ -12,11 +12,11 @@ import warp as wp
 from warp_corot.errors import InputError
 from warp_corot.kernels.contact import motion as kernels
 from warp_corot.kernels.contact import sums
+from warp_corot.kernels.contact.explicit_rows import Rigid
 from warp_corot.kernels.contact.law import Law
 from warp_corot.kernels.contact.rows import Rows
 from warp_corot.kernels.contact.shapes import Shapes
 from warp_corot.kernels.contact.sums import measure_gaps
-from warp_corot.kernels.contact.vertices import Rigid
 from warp_corot.kernels.contact.watch import Watch, move_obstacles
 from warp_corot.solvers.system import System
 

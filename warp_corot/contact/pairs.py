@@ -7,8 +7,8 @@ import numpy.typing as npt
 import warp as wp
 
 from warp_corot.errors import UnstableError
-from warp_corot.kernels.contact import boxes, wide_tree
 from warp_corot.kernels.contact import search as kernels
+from warp_corot.kernels.contact import wide_tree
 from warp_corot.kernels.contact.crushed import mark_crushed
 from warp_corot.kernels.contact.rows import Meeting, OldRows, Rows, begin_rows, end_rows, keep_rows
 from warp_corot.kernels.contact.search import pair_finder
@@ -178,7 +178,7 @@ class Pairs:
         self._built = self.search.count
         for k, tree in enumerate(self._trees):
             roots = self.meeting.roots[k]
-            wp.launch(boxes.find_roots, roots.size, [tree.id], [roots.flatten()], device=self.device)
+            wp.launch(wide_tree.find_roots, roots.size, [tree.id], [roots.flatten()], device=self.device)
 
     def forget(self) -> None:
         """Forget the forces of the last step."""
@@ -188,7 +188,7 @@ class Pairs:
 
     def _box(self) -> None:
         inputs = [self.surface.arrays, self.meeting]
-        boxed = (boxes.box_triangles, boxes.box_edges)
+        boxed = (wide_tree.box_triangles, wide_tree.box_edges)
         for kernel, (lower, upper) in zip(boxed, self._boxes, strict=True):
             wp.launch(kernel, len(lower), inputs, [lower, upper], device=self.device)
 

@@ -10,9 +10,8 @@ import warp as wp
 
 from warp_corot.errors import UnstableError
 from warp_corot.kernels.contact import beside
-from warp_corot.kernels.contact import sleep as sleeping
 from warp_corot.kernels.contact import watch as kernels
-from warp_corot.kernels.contact.vertices import Rigid
+from warp_corot.kernels.contact.explicit_rows import Rigid
 from warp_corot.solvers.pace import Mapped
 
 from .surface import ContactSurface
@@ -268,7 +267,7 @@ class Sleep:
             inputs = [threads, start, count, nodes, int(self.is_framed), moved, obstacles.motions]
             inputs += [body.conditions.world_starts, self._system.pace.arrays, offset]
             inputs += [*self._places(k), body.state.velocities]
-            wp.launch(sleeping.rouse, threads, inputs, [self._watch], device=self._device)
+            wp.launch(kernels.rouse, threads, inputs, [self._watch], device=self._device)
         # A branch takes longer than launches that end at once.
         act()
 
@@ -277,7 +276,7 @@ class Sleep:
         for k in range(len(self._system.bodies)):
             start, count, nodes = self._surface.nodes_of(k)
             inputs = [start, nodes, int(self.is_framed), self._system.pace.arrays, *self._places(k)]
-            wp.launch(sleeping.check_sleep, count, inputs, [self._watch], device=self._device)
+            wp.launch(kernels.check_sleep, count, inputs, [self._watch], device=self._device)
 
     def _places(self, k: int) -> list[wp.array]:
         """Rest positions and displacements of a body."""
