@@ -2,7 +2,8 @@
 
 A visit to a place of the surface finds how far it is from obstacles. The nodes that carry it may go as far before the
 next visit, less what obstacles have come nearer, so that a step looks at nothing but how far each of these nodes has
-gone. After Mirtich, Impulse-based dynamic simulation of rigid body systems (1996), section 2.3.
+gone. After Mirtich, Impulse-based dynamic simulation of rigid body systems (1996), section 2.3. Several threads add to
+the lists of what is visited.
 """
 
 import warp as wp
@@ -12,17 +13,137 @@ from warp_corot.kernels.elements.simd8 import on_cpu
 from warp_corot.kernels.modules import INLINED
 from warp_corot.kernels.stepping.pace import DONE, DT, Pace, length_before
 
-from .bearing import find_borne, is_borne
+from .bearing import carriers_of, find_borne
+from .explicit_rows import FORESEEN, OUT, Rigid
 from .explicit_step import push
 from .mass_split import Sums, take_force
-from .motion import Bearing, Foreseen, Motions, Surface, distance_between, foreseen, kick_of
+from .motion import Bearing, Dynamics, Foreseen, Motions, Surface, distance_between, foreseen, kick_of
 from .shapes import GROUND, distance_to, sure_distance
-from .touches import Touches
-from .vertices import FORESEEN, OUT, Rigid
-from .visits import LATE, LISTED, Part, Visits, append, choose, claim, lower_budget
-from .watch import FAR, FARTHEST, STABLE, Near, Watch, begin_obstacle, pair_of
+from .watch import BESIDE, FAR, FARTHEST, STABLE, Near, Watch, begin_obstacle, pair_of
 
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": INLINED})
+
+#: Flags for places that were not visited in the step before, and for those that may touch something in this one.
+LATE, LISTED = wp.constant(16), wp.constant(32)
+
+
+@wp.struct
+class Part:
+    """The surface of a body. Its carriers are places, or the nodes that bear them; see ``Visits``."""
+
+    number: int
+    place: int  # its first place
+    start: int  # its first carrier among ``nodes``
+    shift: int  # how much larger the numbers of these are among all carriers
+    nodes: Surface
+    dynamics: Dynamics
+
+
+@wp.struct
+class Visits:
+    """What steps visit. Carriers are all places, [S], and then all nodes that bear places, [B]: [N] = [S + B]."""
+
+    # [N] a displacement, and how far the carrier may go from there before it is due, plus ``came`` then [m]
+    budgets: wp.array[wp.vec4]
+    # [N] how far the carrier has come to this displacement since all places were visited [m]
+    ways: wp.array[wp.float32]
+    # of each place that a carrier bears, as in ``Bearing.places``: ``ways`` plus ``came`` at which it is visited [m]
+    until: wp.array[wp.float32]
+    entries: wp.array[wp.vec4i]  # [S] where these are for the nodes that bear a place
+    needs: wp.array[wp.float32]  # [N] how much of their budgets must be left in this step for those that are due [m]
+    spans: wp.array[wp.float32]  # [S] the longest edge around a place at rest [m]
+    # [2] how far any obstacle has gone since all places were visited, and goes in this step, at most [m]
+    came: wp.array[wp.float32]
+    step: wp.array[wp.int64]  # [1] the number of the last step
+    is_first: wp.array[wp.int32]  # [1] whether this step visits everything
+    may_miss: wp.array[wp.int32]  # [1] whether places may not have moved into obstacles unseen
+    count: wp.array[wp.int32]  # [1] the number of steps, ever
+    body: wp.array[wp.int32]  # [S] the body of a place
+    first_place: wp.array[wp.int32]  # [bodies]
+    places: wp.array[wp.int32]  # [S] that number at the last visit to a place
+    touches: wp.array[wp.int32]  # [O T] the same for an obstacle and a triangle
+    contacts: wp.array[wp.int32]  # contacts of places and of pairs that may act, by their numbers in ``mass_split``
+    contact_count: wp.array[wp.int32]  # [1]
+    carriers: wp.array[wp.int32]  # [N] that number when the motion of a carrier was found last
+    # Lists for each body, from its first place or carrier on, and how many there are in each, [bodies]:
+    chosen: wp.array[wp.int32]  # [S] the places that are visited in this step
+    chosen_count: wp.array[wp.int32]
+    due: wp.array[wp.int32]  # [N] those that are due, by their numbers among ``nodes`` of a ``Part``
+    due_count: wp.array[wp.int32]
+    carrying: wp.array[wp.int32]  # [N] those whose motion is known
+    carrying_count: wp.array[wp.int32]
+    triangles: wp.array[wp.vec3i]  # [T]
+    corner_starts: wp.array[wp.int32]  # [S + 1] the triangles around each place, see ``Skin``
+    corners: wp.array[wp.int32]
+    # [S] displacements of places at the last search for pairs; how far they have come from there, and go in this step
+    # without contact, as carriers [N] do; and the means of these in each world, [W] [m]
+    searched: wp.array[wp.vec4]
+    gone: wp.array[wp.vec4]
+    goes: wp.array[wp.vec4]
+    carried: wp.array[wp.vec4]
+    mean_gone: wp.array[wp.vec4]
+    mean_goes: wp.array[wp.vec4]
+    is_shared: int  # whether several threads visit at the same time
+
+
+# Where one thread works, plain instructions take a fraction of the time of atomic ones.
+@wp.func_native(
+    on_cpu(
+        """
+    int& now = wp::index(a, i);
+    if (now == value) return false;
+    if (is_shared) return __atomic_exchange_n(&now, value, __ATOMIC_RELAXED) != value;
+    now = value;
+    return true;
+""",
+        otherwise="return false;\n",
+    )
+)
+def claim(a: wp.array[wp.int32], i: int, value: int, is_shared: int) -> bool:
+    """Write a value. Returns whether there was another one, to one thread of those that ask at the same time."""
+    ...
+
+
+@wp.func_native(
+    on_cpu("""
+    int& end = wp::index(counts, k);
+    wp::index(list, first + (is_shared ? __atomic_fetch_add(&end, 1, __ATOMIC_RELAXED) : end++)) = item;
+""")
+)
+def append(list: wp.array[wp.int32], first: int, counts: wp.array[wp.int32], k: int, item: int, is_shared: int):
+    """Add an item to the end of the k-th list, which begins at ``first``."""
+    ...
+
+
+@wp.func
+def choose(s: int, here: Near, visits: Visits):
+    """Visit a place in this step, once. Returns whether it was not chosen before."""
+    was = visits.places[s]
+    if not claim(visits.places, s, visits.count[0], visits.is_shared):
+        return False
+    k = visits.body[s]
+    append(visits.chosen, visits.first_place[k], visits.chosen_count, k, s, visits.is_shared)
+    here.flags[s] = BESIDE | wp.where(was + 1 < visits.count[0], LATE, 0)
+    return True
+
+
+@wp.func_native(
+    on_cpu("""
+    // The order of numbers that are not negative is that of their bits.
+    int* to = reinterpret_cast<int*>(&wp::index(budgets, n)) + 3;
+    const int bits = *reinterpret_cast<const int*>(&most);
+    if (is_shared) {
+        int now = __atomic_load_n(to, __ATOMIC_RELAXED);
+        while (bits < now && !__atomic_compare_exchange_n(to, &now, bits, true, __ATOMIC_RELAXED, __ATOMIC_RELAXED));
+    } else if (bits < *to) *to = bits;
+""")
+)
+def lower_budget(budgets: wp.array[wp.vec4], n: int, most: float, is_shared: int):
+    """Lower a budget to at most a value that is not negative."""
+    ...
+
+
+# --- steps ------------------------------------------------------------------------------------------------------------
 
 #: The phases of a visit.
 CHOOSE, CARRY, PLACE, CORNERS, LIMIT = (wp.constant(k) for k in range(5))
@@ -57,7 +178,7 @@ def begin_visits(
     pace: Pace,
     world_starts: wp.array[wp.float64],
     offset: int,
-    touches: Touches,
+    rigid: Rigid,
     # In and out
     watch: Watch,
     here: Near,
@@ -72,9 +193,8 @@ def begin_visits(
     kept = int(0)
     for k in range(here.touch_count[0]):
         pair = here.touches[k]
-        force = touches.force[pair // touches.force.shape[1], pair % touches.force.shape[1]]
         # A triangle with a force is found again, wherever it is now.
-        if wp.length_sq(force) > 0.0:
+        if wp.length_sq(rigid.rows.force[rigid.first_triangle + pair]) > 0.0:
             here.touches[kept] = pair
             kept += 1
         else:
@@ -223,21 +343,13 @@ def end_run(pace: Pace, watch: Watch):
 
 
 @wp.func
-def carriers_of(s: int, surface: Surface):
-    """The numbers of the nodes that carry a place, and its weights."""
-    if is_borne(s, surface):
-        return surface.bearing.bearers[s], surface.bearing.weights[s]
-    return wp.vec4i(s, s, s, s), wp.vec4(1.0, 0.0, 0.0, 0.0)
-
-
-@wp.func
 def position_of(s: int, part: Part, surface: Surface, share: float):
     """Where a place is that this step need not visit, with this share of its displacement: zero is at rest."""
     n, w = carriers_of(s, surface)
     x = wp.vec3()
     for m in range(4):
         if w[m] != 0.0:
-            i = part.nodes.node[n[m]]
+            i = part.nodes.node[n[m] - part.shift]
             x += w[m] * (part.nodes.rest[n[m]] + share * load_node(part.dynamics.u, i))
     return x
 
@@ -258,8 +370,8 @@ def carry(s: int, part: Part, pace: Pace, offset: int, surface: Surface, visits:
     """Find the motion of the carriers of a place in this step without contact, and begin to measure their way here."""
     b, _w = carriers_of(s, surface)
     for m in range(4):
-        n = b[m]
-        c = n + part.shift
+        c = b[m]
+        n = c - part.shift
         if claim(visits.carriers, c, visits.count[0], visits.is_shared):
             i = part.nodes.node[n]
             know(n, foreseen(i, part.dynamics, pace, offset), part, visits)
@@ -279,7 +391,8 @@ def room_beside(s: int, has_edges: int, part: Part, rigid: Rigid, watch: Watch, 
     may_touch = bool(False)
     farthest = FARTHEST * watch.size
     room = float(farthest)
-    for o in range(rigid.forces.shape[0]):
+    for o in range(rigid.shapes.kind.shape[0]):
+        r = o * surface.node.shape[0] + s
         span = float(0.0)
         if has_edges != 0 and rigid.shapes.kind[o] != GROUND:
             span = LONG * visits.spans[s]
@@ -287,10 +400,10 @@ def room_beside(s: int, has_edges: int, part: Part, rigid: Rigid, watch: Watch, 
         distance, _n = distance_to(rigid.shapes, o, pose, x, room + span + rigid.law.tolerance)
         gap = sure_distance(rigid.shapes, o, distance) - rigid.law.tolerance
         # A place that could act in the last step is found once more.
-        holds = rigid.allowance[o, s] != 0.0 or wp.length_sq(rigid.forces[o, s]) > 0.0
-        if gap <= close or rigid.acts[o, s] != OUT or holds:
+        holds = rigid.allowance[r] != 0.0 or wp.length_sq(rigid.rows.force[r]) > 0.0
+        if gap <= close or rigid.rows.acts[r] != OUT or holds:
             may_touch = True
-            append(visits.contacts, 0, visits.contact_count, 0, o * surface.node.shape[0] + s, visits.is_shared)
+            append(visits.contacts, 0, visits.contact_count, 0, r, visits.is_shared)
         if holds:
             gap = wp.min(gap, 0.0)
         elif gap < -watch.least[0] and (here.flags[s] & LATE) != 0 and visits.may_miss[0] != 0:
@@ -374,9 +487,9 @@ def visit(
             left = visits.came[0] + room / (wp.abs(w[0]) + wp.abs(w[1]) + wp.abs(w[2]) + wp.abs(w[3]))
             for m in range(4):
                 if w[m] != 0.0:
-                    lower_budget(visits.budgets, b[m] + part.shift, left, visits.is_shared)
+                    lower_budget(visits.budgets, b[m], left, visits.is_shared)
                     if are_borne:
-                        visits.until[visits.entries[s][m]] = visits.ways[b[m] + part.shift] + left
+                        visits.until[visits.entries[s][m]] = visits.ways[b[m]] + left
     if first <= CORNERS and last >= CORNERS and thread == 0:
         for k in range(here.touch_count[0]):
             for m in range(3):
@@ -449,5 +562,5 @@ def complete_triangles(
                     b, w = carriers_of(r, surface)
                     x = position_of(r, part, surface, 1.0)
                     for m in range(4):
-                        x -= (w[m] * before) * load_node(part.dynamics.v, part.nodes.node[b[m]])
+                        x -= (w[m] * before) * load_node(part.dynamics.v, part.nodes.node[b[m] - part.shift])
                     surface.x[r] = x

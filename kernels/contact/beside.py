@@ -4,11 +4,8 @@ import warp as wp
 
 from warp_corot.kernels.stepping.threads import spread_thread, synchronize_grid
 
-from .boxes import raise_by_warp
+from .explicit_rows import Rigid
 from .shapes import GROUND, distance_to, sure_distance
-from .sleep import end_search
-from .touches import Touches
-from .vertices import Rigid
 from .watch import (
     AROUND,
     ASKED,
@@ -19,10 +16,12 @@ from .watch import (
     add_motion,
     begin_search,
     end_asking,
+    end_search,
     fastest_motion,
     leave_room,
     mark,
 )
+from .wide_tree import raise_by_warp
 
 wp.set_module_options({"enable_backward": False})
 
@@ -43,7 +42,7 @@ def find_node(s: int, watch: Watch, rigid: Rigid, near: Near):
     """Mark a node that may touch an obstacle before the next search. Obstacles exert no forces on other nodes."""
     if rigid.surface.node[s] >= 0:
         world = rigid.surface.world[s]
-        for o in range(rigid.forces.shape[0]):
+        for o in range(rigid.shapes.kind.shape[0]):
             far = watch.reach[s] + watch.reach_of[world, o] + rigid.law.tolerance
             gap, _normal = distance_to(
                 rigid.shapes, o, rigid.motions.now[world, o], rigid.surface.x[s], far + horizon(watch)
@@ -52,16 +51,16 @@ def find_node(s: int, watch: Watch, rigid: Rigid, near: Near):
                 mark(near, s, BESIDE)
                 return
             leave_room(sure_distance(rigid.shapes, o, gap) - far, watch)
-    for o in range(rigid.forces.shape[0]):
-        rigid.forces[o, s] = wp.vec3()
-        rigid.anchors[o, s] = wp.vec4()
+    for o in range(rigid.shapes.kind.shape[0]):
+        rigid.rows.force[o * rigid.surface.node.shape[0] + s] = wp.vec3()
+        rigid.anchors[o * rigid.surface.node.shape[0] + s] = wp.vec4()
 
 
 @wp.func
-def find_triangle(
-    o: int, t: int, watch: Watch, rigid: Rigid, triangles: wp.array[wp.vec3i], near: Near, touches: Touches
-):
+def find_triangle(pair: int, watch: Watch, rigid: Rigid, triangles: wp.array[wp.vec3i], near: Near):
     """List a triangle that may touch an obstacle before the next search. Obstacles exert no forces on other ones."""
+    o = pair // triangles.shape[0]
+    t = pair % triangles.shape[0]
     corners = triangles[t]
     if rigid.shapes.kind[o] != GROUND and corners[0] >= 0:
         world = rigid.surface.world[corners[0]]
@@ -77,14 +76,15 @@ def find_triangle(
         if gap > far:
             leave_room(sure_distance(rigid.shapes, o, gap) - far, watch)
         else:
-            near.touches[wp.atomic_add(near.touch_count, 0, 1)] = o * triangles.shape[0] + t
+            near.touches[wp.atomic_add(near.touch_count, 0, 1)] = pair
             for k in range(3):
                 mark(near, corners[k], AROUND)
             return
-    touches.shares[o, t] = wp.vec3()
-    touches.force[o, t] = wp.vec3()
-    touches.more[o, t] = wp.vec3()
-    touches.acts[o, t] = 0
+    r = rigid.first_triangle + pair
+    rigid.rows.weights[r] = wp.vec4()
+    rigid.rows.force[r] = wp.vec3()
+    rigid.rows.more[r] = wp.vec3()
+    rigid.rows.acts[r] = 0
 
 
 @wp.kernel(enable_backward=False, grid_stride=False, launch_bounds=(64, 4))
@@ -100,7 +100,6 @@ def search_near(
     rigid: Rigid,
     watch: Watch,
     near: Near,
-    touches: Touches,
     arrived: wp.array[wp.uint32],
 ):
     """Make some phases of a search, if one is due. Those for soft surfaces come before ``BESIDE``.
@@ -118,7 +117,7 @@ def search_near(
         return
     surface = rigid.surface
     places = surface.node.shape[0]
-    obstacles = rigid.forces.shape[0]
+    pairs = rigid.rows.force.shape[0] - rigid.first_triangle
     poses = watch.poses.shape[0] * watch.poses.shape[1]
     start = spread_thread(thread, threads, BLOCK)
     phase = int(first)
@@ -145,13 +144,11 @@ def search_near(
                 end_asking(k, watch)
                 k += threads
             k = start
-            while obstacles > 0 and k < places + touches.force.shape[0] * touches.force.shape[1]:
+            while rigid.shapes.kind.shape[0] > 0 and k < places + pairs:
                 if k < places:
                     find_node(k, watch, rigid, near)
                 else:
-                    pair = k - places
-                    count = triangles.shape[0]
-                    find_triangle(pair // count, pair % count, watch, rigid, triangles, near, touches)
+                    find_triangle(k - places, watch, rigid, triangles, near)
                 k += threads
         elif thread == 0:
             end_search(sleeps, near, watch)

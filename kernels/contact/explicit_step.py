@@ -7,7 +7,7 @@ from warp_corot.kernels.modules import INLINED
 from warp_corot.kernels.stepping.balance import count_constraint
 from warp_corot.kernels.stepping.pace import Pace
 
-from .bearing import place_among
+from .bearing import place_among, store_borne
 from .mass_split import Sums, take_force
 from .motion import Dynamics, Foreseen, Motions, Surface, force_at, foreseen
 from .watch import Watch, begin_obstacle, follow_node, pair_of
@@ -83,12 +83,7 @@ def begin_step(
                 i = bearers.node[b[m]]
                 own = foreseen(i, body, pace, offset)
                 place = place_among(place, w[m], own)
-            surface.rest[s] = place.rest
-            surface.x[s] = place.x
-            surface.d[s] = place.d
-            surface.yielding[s] = place.yielding
-            surface.bearing.loose[s] = wp.clamp(place.loose, 0.0, 1.0)
-            surface.bearing.held[s] = place.held
+            store_borne(s, place, surface)
 
 
 # --- the end ----------------------------------------------------------------------------------------------------------

@@ -1,7 +1,7 @@
 """All contacts of an implicit step as one table of rows, and what a step asks of them.
 
 A row is an obstacle at a place, an obstacle at a triangle, or a pair of soft surfaces: up to four places with weights,
-whose weighted motion opens it. Nodes bear a place, or it is a node itself. See ``springs`` for a row's force, with a
+whose weighted motion opens it. Nodes bear a place, or it is a node itself. See ``law`` for a row's force, with a
 stiffness like that of the nodes around it. Each time the step has been solved for, rows are located again and their
 forces become their multipliers; see ``obstacle_rows`` and ``pair_rows``. While the step is solved for, a row stays what
 it was located as, a plane that nothing passes.
@@ -13,13 +13,21 @@ from warp_corot.kernels.elements.elements import load_node, store_node
 from warp_corot.kernels.implicit.assembled import Couplings, add_block, begin_coupling, end_coupling, root_columns
 from warp_corot.kernels.implicit.line_search import TRIED
 
-from .bearing import is_borne, loose_at, loose_part
-from .carriers import Carriers, couple_at, ease_at, mark_carriers, motion_at, push_at
-from .contact_curvature import Rolling, share_of_moment, tilted
+from .bearing import (
+    Carriers,
+    couple_at,
+    ease_at,
+    is_borne,
+    loose_at,
+    loose_part,
+    mark_carriers,
+    motion_at,
+    push_at,
+)
+from .closest import Rolling, share_of_moment, tilted
+from .law import bound_of, spring_state
 from .motion import Surface
 from .rows import Rows, row_count
-from .springs import bound_of, spring_state
-from .touches import Touches
 
 wp.set_module_options({"enable_backward": False})
 
@@ -509,41 +517,43 @@ def keep_pair_forces(threads: int, rows: ImplicitRows, pairs: Rows, searches: wp
         k += threads
 
 
+@wp.func
+def end_row(r: int, own: int, force: wp.vec3, rows: ImplicitRows, kept: Rows):
+    """Keep a row of obstacles or a pair, by its number there, for the next step."""
+    kept.force[own] = force
+    kept.acts[own] = int(wp.length_sq(force) > 0.0)
+    if r >= rows.first_triangle and r < rows.first_pair and rows.listed[r] != 0:
+        kept.weights[own] = rows.weights[r]
+        kept.normal[own] = rows.normal[r]
+        kept.gap[own] = rows.gap[r]
+
+
 @wp.kernel(enable_backward=False)
 def end_rows(
     # In
     threads: int,
     rows: ImplicitRows,
     # Out
-    forces: wp.array2d[wp.vec3],
-    touches: Touches,
+    beside: Rows,
     pairs: Rows,
     added: wp.array[wp.vec3],
 ):
-    """Keep forces for the next step, and where they are, and gather them at places, held ones too."""
+    """Keep forces for the next step, and where they are, and gather them at places, held ones too.
+
+    Args:
+        beside: The rows of obstacles.
+    """
     r = wp.tid()
-    count = rows.first_pair + row_count(pairs)
-    while r < count:
+    while r < rows.first_pair + row_count(pairs):
         force = wp.vec3()
         if rows.listed[r] != 0:
             force = rows.force[r]
-        acts = int(wp.length_sq(force) > 0.0)
-        w = rows.weights[r]
-        if r < rows.first_triangle:
-            forces[r / forces.shape[1], r % forces.shape[1]] = force
-        elif r < rows.first_pair:
-            o = (r - rows.first_triangle) / touches.force.shape[1]
-            t = (r - rows.first_triangle) % touches.force.shape[1]
-            touches.force[o, t] = force
-            touches.acts[o, t] = acts
-            if rows.listed[r] != 0:
-                touches.shares[o, t] = corner_weights(r, rows)
-                touches.normal[o, t] = rows.normal[r]
-                touches.gap[o, t] = rows.gap[r]
+        if r < rows.first_pair:
+            end_row(r, r, force, rows, beside)
         else:
-            pairs.force[r - rows.first_pair] = force
-            pairs.acts[r - rows.first_pair] = acts
-        if acts != 0:
+            end_row(r, r - rows.first_pair, force, rows, pairs)
+        if wp.length_sq(force) > 0.0:
+            w = rows.weights[r]
             for k in range(4):
                 if w[k] != 0.0:
                     wp.atomic_add(added, rows.places[r][k], w[k] * force)

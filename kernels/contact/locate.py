@@ -4,10 +4,10 @@ import warp as wp
 
 from .bearing import is_borne
 from .closest import on_segments, on_triangle, point_of
-from .law import Law, held_back
+from .explicit_rows import FORESEEN
+from .law import Law, across, held_back
 from .motion import Surface
 from .rows import BAND, BAND_AT_REST, BAND_OF_NEIGHBOURS, Meeting, Rows, triangle_normal
-from .vertices import FORESEEN, across
 
 wp.set_module_options({"enable_backward": False})
 
@@ -168,7 +168,7 @@ def locate_node(row: int, s: int, t: int, surface: Surface, meeting: Meeting, ro
     if gap < 0.0 and not is_borne(s, surface) and is_nearer_to_a_side(s, t, w, n, -gap, size, surface, meeting):
         return False
     rows.places[row] = wp.vec4i(s, c[0], c[1], c[2])
-    rows.shares[row] = wp.vec4(1.0, -w[0], -w[1], -w[2])
+    rows.weights[row] = wp.vec4(1.0, -w[0], -w[1], -w[2])
     rows.normal[row] = n
     rows.gap[row] = gap
     is_self = meeting.body[s] == meeting.body[c[0]]
@@ -218,7 +218,7 @@ def locate_edge(row: int, first: int, second: int, surface: Surface, meeting: Me
         apart = surface.rest[f[0]] + s * (surface.rest[f[1]] - surface.rest[f[0]])
         apart -= surface.rest[g[0]] + t * (surface.rest[g[1]] - surface.rest[g[0]])
     rows.places[row] = wp.vec4i(f[0], f[1], g[0], g[1])
-    rows.shares[row] = wp.vec4(1.0 - s, s, -(1.0 - t), -t)
+    rows.weights[row] = wp.vec4(1.0 - s, s, -(1.0 - t), -t)
     rows.normal[row] = n
     rows.gap[row] = gap
     if gap > deepest(size, is_self, apart):
@@ -253,7 +253,7 @@ def leans_over(row: int, surface: Surface, meeting: Meeting, rows: Rows):
     """
     t = rows.other[row]
     c = meeting.triangles[t]
-    share = rows.shares[row]
+    share = rows.weights[row]
     first = int(-1)
     last = int(-1)
     corners = int(0)
@@ -327,7 +327,7 @@ def list_by_warp(live: wp.array[wp.int32], count: wp.array[wp.int32], row: int, 
 @wp.func
 def may_push(row: int, law: Law, surface: Surface, rows: Rows):
     """Whether a pair that has just been located may push in this step, whatever pushes its places."""
-    w = rows.shares[row]
+    w = rows.weights[row]
     if w[0] <= 0.0:
         return False
     force = rows.force[row]
@@ -360,7 +360,7 @@ def locate_row(row: int, law: Law, surface: Surface, meeting: Meeting, rows: Row
     rows.more[row] = wp.vec3()
     rows.acts[row] = 0
     if not is_near:
-        rows.shares[row] = wp.vec4()
+        rows.weights[row] = wp.vec4()
         return False
     n = rows.normal[row]
     # Keep all of it: if each step lost a part, surfaces would sink in until the overlap replaces that part, and would

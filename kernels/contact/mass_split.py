@@ -17,17 +17,16 @@ from types import SimpleNamespace
 import warp as wp
 
 from warp_corot.kernels.elements.simd8 import on_cpu
-from warp_corot.kernels.modules import unique_kernel
+from warp_corot.kernels.modules import INLINED, unique_kernel
 from warp_corot.kernels.stepping.pace import DT, Pace
 from warp_corot.kernels.stepping.threads import spread_thread, synchronize_blocks, synchronize_grid
 
 from .bearing import MOSTLY, is_borne, left_between, loose_share
-from .law import Law, held_back, least_motion, left_to_held
+from .explicit_rows import ACTS, BEGINS, ENDS, OUT, WAITS, Rigid, anchor, begin_place, find_touch
+from .law import Law, across, held_back, least_motion, left_to_held
 from .locate import list_by_warp, locate_row
 from .motion import Surface
 from .rows import Meeting, Rows, row_count
-from .touches import Touches, find_touch
-from .vertices import ACTS, BEGINS, ENDS, OUT, WAITS, Rigid, across, anchor, begin_place
 from .watch import BESIDE, Near
 
 wp.set_module_options({"enable_backward": False})
@@ -87,15 +86,13 @@ class Contact:
 
 @wp.struct
 class Contacts:
-    """All that there may be. Numbers: S for each obstacle, then T for each obstacle, and then the pairs."""
+    """All that there may be: the rows of obstacles, and then the pairs."""
 
-    first_triangle: int  # the first number of a triangle
     first_pair: int  # the first number of a pair
     rigid: Rigid
     triangles: wp.array[wp.vec3i]
-    touches: Touches
     meeting: Meeting
-    rows: Rows
+    pairs: Rows
 
 
 @wp.func
@@ -121,84 +118,26 @@ def parents_of(s: int, surface: Surface):
 
 
 @wp.func
-def read_place(number: int, all: Contacts):
-    """A place and an obstacle."""
-    places = all.rigid.surface.node.shape[0]
-    o = number // places
-    s = number % places
+def read_row(r: int, rows: Rows):
+    """A row that has been located in this step, without its places."""
     found = Contact()
-    away = all.rigid.away[o, s]
-    found.places = wp.vec4i(s, -1, -1, -1)
-    found.weights = wp.vec4(1.0, 0.0, 0.0, 0.0)
-    found.normal = wp.vec3(away[0], away[1], away[2])
-    found.gap = away[3]
-    found.moved = all.rigid.moved[o, s]
-    found.friction = all.rigid.shapes.friction[o]
-    found.force = all.rigid.forces[o, s]
-    found.more = all.rigid.more[o, s]
-    found.acts = all.rigid.acts[o, s]
+    found.weights = rows.weights[r]
+    found.normal = rows.normal[r]
+    found.gap = rows.gap[r]
+    found.moved = rows.moved[r]
+    found.friction = rows.friction[r]
+    found.force = rows.force[r]
+    found.more = rows.more[r]
+    found.acts = rows.acts[r]
     return found
 
 
 @wp.func
-def keep_place(number: int, contact: Contact, rigid: Rigid):
-    places = rigid.surface.node.shape[0]
-    o = number // places
-    s = number % places
-    rigid.forces[o, s] = contact.force
-    rigid.more[o, s] = contact.more
-    rigid.acts[o, s] = contact.acts
-
-
-@wp.func
-def read_triangle(pair: int, triangles: wp.array[wp.vec3i], touches: Touches):
-    """A triangle and an obstacle."""
-    o = pair // triangles.shape[0]
-    t = pair % triangles.shape[0]
-    found = Contact()
-    c = triangles[t]
-    w = touches.shares[o, t]
-    found.places = wp.vec4i(c[0], c[1], c[2], -1)
-    found.weights = wp.vec4(w[0], w[1], w[2], 0.0)
-    found.normal = touches.normal[o, t]
-    found.gap = touches.gap[o, t]
-    found.moved = touches.moved[o, t]
-    found.friction = touches.friction[o, t]
-    found.force = touches.force[o, t]
-    found.more = touches.more[o, t]
-    found.acts = touches.acts[o, t]
-    return found
-
-
-@wp.func
-def keep_triangle(pair: int, contact: Contact, triangles: int, touches: Touches):
-    o = pair // triangles
-    t = pair % triangles
-    touches.force[o, t] = contact.force
-    touches.more[o, t] = contact.more
-    touches.acts[o, t] = contact.acts
-
-
-@wp.func
-def read_row(row: int, meeting: Meeting, rows: Rows):
-    """A pair of soft surfaces."""
-    found = Contact()
-    found.places = rows.places[row]
-    found.weights = rows.shares[row]
-    found.normal = rows.normal[row]
-    found.gap = rows.gap[row]
-    found.friction = meeting.friction
-    found.force = rows.force[row]
-    found.more = rows.more[row]
-    found.acts = rows.acts[row]
-    return found
-
-
-@wp.func
-def keep_row(row: int, contact: Contact, rows: Rows):
-    rows.force[row] = contact.force
-    rows.more[row] = contact.more
-    rows.acts[row] = contact.acts
+def keep_row(r: int, contact: Contact, rows: Rows):
+    """Store what an iteration changes."""
+    rows.force[r] = contact.force
+    rows.more[r] = contact.more
+    rows.acts[r] = contact.acts
 
 
 # --- sums at nodes ---------------------------------------------------------------------------------------------------
@@ -292,14 +231,19 @@ def phases(has_triangles: bool, has_pairs: bool) -> SimpleNamespace:
     def contact_of(number: int, dt: float, all: Contacts):
         """The contact with a number, which has been located in this step."""
         found = Contact()
-        if number < all.first_triangle:
-            found = read_place(number, all)
-        if wp.static(has_triangles):
-            if number >= all.first_triangle and number < all.first_pair:
-                found = read_triangle(number - all.first_triangle, all.triangles, all.touches)
+        if number < all.first_pair:
+            found = read_row(number, all.rigid.rows)
+            found.places = wp.vec4i(number % all.rigid.surface.node.shape[0], -1, -1, -1)
+            if wp.static(most == 1):
+                found.weights = wp.vec4(1.0, 0.0, 0.0, 0.0)
+            if wp.static(has_triangles):
+                if number >= all.rigid.first_triangle:
+                    c = all.triangles[(number - all.rigid.first_triangle) % all.triangles.shape[0]]
+                    found.places = wp.vec4i(c[0], c[1], c[2], -1)
         if wp.static(has_pairs):
             if number >= all.first_pair:
-                found = read_row(number - all.first_pair, all.meeting, all.rows)
+                found = read_row(number - all.first_pair, all.pairs)
+                found.places = all.pairs.places[number - all.first_pair]
         surface = all.rigid.surface
         found.parents = parents_of(found.places[0], surface)
         found.opens = -found.moved
@@ -320,15 +264,11 @@ def phases(has_triangles: bool, has_pairs: bool) -> SimpleNamespace:
 
     @wp.func
     def keep(number: int, contact: Contact, all: Contacts):
-        """Store what an iteration changes."""
-        if number < all.first_triangle:
-            keep_place(number, contact, all.rigid)
-        if wp.static(has_triangles):
-            if number >= all.first_triangle and number < all.first_pair:
-                keep_triangle(number - all.first_triangle, contact, all.triangles.shape[0], all.touches)
+        if number < all.first_pair:
+            keep_row(number, contact, all.rigid.rows)
         if wp.static(has_pairs):
             if number >= all.first_pair:
-                keep_row(number - all.first_pair, contact, all.rows)
+                keep_row(number - all.first_pair, contact, all.pairs)
 
     @wp.func
     def add(contact: Contact, times: int, force: wp.vec3, buffer: int, grain: float, surface: Surface, sums: Sums):
@@ -350,18 +290,15 @@ def phases(has_triangles: bool, has_pairs: bool) -> SimpleNamespace:
         """Find a contact in this step, with the force with which it begins. Returns whether it may act."""
         surface = all.rigid.surface
         law = all.rigid.law
-        places = surface.node.shape[0]
         is_near = bool(False)
-        if number < all.first_triangle:
-            is_near = begin_place(number % places, number // places, dt, all.rigid)
+        if number < all.rigid.first_triangle:
+            is_near = begin_place(number, dt, all.rigid)
         if wp.static(has_triangles):
-            if number >= all.first_triangle and number < all.first_pair:
-                pair = number - all.first_triangle
-                count = all.triangles.shape[0]
-                is_near = find_touch(pair // count, pair % count, all.rigid, all.triangles, all.touches)
+            if number >= all.rigid.first_triangle and number < all.first_pair:
+                is_near = find_touch(number, all.rigid, all.triangles)
         if wp.static(has_pairs):
             if number >= all.first_pair:
-                is_near = locate_row(number - all.first_pair, law, surface, all.meeting, all.rows)
+                is_near = locate_row(number - all.first_pair, law, surface, all.meeting, all.pairs)
         if not is_near:
             return 0
         contact = contact_of(number, dt, all)
@@ -426,17 +363,17 @@ def phases(has_triangles: bool, has_pairs: bool) -> SimpleNamespace:
     @wp.func
     def contact_count(near: Near, all: Contacts):
         """How many contacts there may be in this step."""
-        count = near.count[0] * all.rigid.forces.shape[0]
+        count = near.count[0] * all.rigid.shapes.kind.shape[0]
         if wp.static(has_triangles):
             count += near.touch_count[0]
         if wp.static(has_pairs):
-            count += row_count(all.rows)
+            count += row_count(all.pairs)
         return count
 
     @wp.func
     def number_of(k: int, near: Near, all: Contacts):
         """The number of the k-th of them; -1 for a place that no obstacle is near."""
-        obstacles = all.rigid.forces.shape[0]
+        obstacles = all.rigid.shapes.kind.shape[0]
         beside = near.count[0] * obstacles
         if k < beside:
             s = near.nodes[k // obstacles]
@@ -447,9 +384,9 @@ def phases(has_triangles: bool, has_pairs: bool) -> SimpleNamespace:
         if wp.static(has_triangles):
             touches += near.touch_count[0]
             if k < touches:
-                return all.first_triangle + near.touches[k - beside]
+                return all.rigid.first_triangle + near.touches[k - beside]
         if wp.static(has_pairs):
-            if k < touches + row_count(all.rows):
+            if k < touches + row_count(all.pairs):
                 return all.first_pair + k - touches
         return -1
 
@@ -479,95 +416,166 @@ def clear_lists(sums: Sums):
     sums.live_count[0] = 0
 
 
+@wp.func
+def is_pushed(contact: Contact, surface: Surface, sums: Sums):
+    """Whether any contact has acted on a place of this one, which otherwise goes on waiting."""
+    pushed = int(0)
+    for k in range(4):
+        if contact.weights[k] != 0.0:
+            parents = contact.parents
+            if k > 0:
+                parents = parents_of(contact.places[k], surface)
+            for m in range(4):
+                pushed |= sums.touched[parents.nodes[m]]
+    return pushed != 0
+
+
 @functools.cache
-def solver(has_triangles: bool, has_pairs: bool) -> wp.Kernel:
-    """The kernel of these contacts, for CUDA; see ``phases``."""
+def solver(has_triangles: bool, has_pairs: bool, on_cpu: bool) -> wp.Kernel:
+    """The kernel of these contacts; see ``phases``. A thread of the CPU takes one contact after another."""
     of = phases(has_triangles, has_pairs)
     contact_of, keep, locate, iterate = of.contact_of, of.keep, of.locate, of.iterate
     contact_count, number_of = of.contact_count, of.number_of
 
-    @unique_kernel(grid_stride=False, launch_bounds=(64, 4), fast_math=True)
+    @wp.func
+    def correct(number: int, before: int, dt: float, all: Contacts, sums: Sums):
+        """Correct the force of a contact in memory; see ``iterate``."""
+        contact = contact_of(number, dt, all)
+        if contact.acts != OUT:
+            keep(number, iterate(contact, before, all.rigid.law, all.rigid.surface, sums), all)
+
+    @wp.func
+    def correct_listed(
+        k: int, phase: int, iterations: int, dt: float, all: Contacts, records: wp.array[Contact], sums: Sums
+    ):
+        """Correct the force of the k-th contact that may act; between iterations it is in a record."""
+        contact = Contact()
+        if phase == LOCATE + 1:
+            contact = contact_of(sums.live[k], dt, all)
+        if phase > LOCATE + 1:
+            contact = records[k]
+        if contact.acts != WAITS or is_pushed(contact, all.rigid.surface, sums):
+            contact = iterate(contact, (phase - 1) % 2, all.rigid.law, all.rigid.surface, sums)
+        if phase < iterations:
+            records[k] = contact
+        else:
+            keep(sums.live[k], contact, all)
+
+    @unique_kernel(grid_stride=False, launch_bounds=(64, 4), fast_math=True, cpu_compiler_flags=INLINED)
     def solve_contacts(
         # In
         threads: int,
+        part: int,
         first: int,
         last: int,
         iterations: int,
         are_separate: int,
         awake: wp.array[wp.int32],
         near: Near,
+        listed: wp.array[wp.int32],
+        listed_count: wp.array[wp.int32],
         pace: Pace,
         # In and out
         all: Contacts,
+        records: wp.array[Contact],
         sums: Sums,
     ):
         """Make some phases of a step: the first one finds all contacts, then there are the iterations, and the last
-        one finds where places go and updates anchors. For CUDA; see ``sweep`` for the CPU.
+        one finds where places go and updates anchors.
 
         Args:
-            threads: The number of threads, of blocks that are all resident.
+            threads: The number of threads, of blocks that are all resident; on the CPU each has a launch of its own.
+            part: The number of this launch among those.
             first, last: The phases, from 0 to ``iterations`` + 1.
             awake: Whether contact is awake, [1]; there are no contacts if it is not.
             are_separate: Whether no two contacts share a node: places that are nodes, and one obstacle. Then a thread
                 goes through all phases of a place by itself.
+            listed, listed_count: On the CPU the contacts of places and of pairs that may act, and how many there are;
+                empty: any.
+            records: On the CPU memory for as many contacts as there usually are.
         """
-        thread = wp.tid()
+        thread = part + wp.tid()
         if awake[0] == 0:
             return
         dt = float(pace.seconds[DT])
-        surface = all.rigid.surface
-        law = all.rigid.law
-        start = spread_thread(thread, threads, BLOCK)
+        start = int(thread)
+        if wp.static(not on_cpu):
+            start = spread_thread(thread, threads, BLOCK)
         k = int(start)
         if first == LOCATE:
-            # Warps stay together.
-            beyond = contact_count(near, all) + wp.where(threads > 1, thread % WARP, 0)
+            beyond = contact_count(near, all)
+            if wp.static(not on_cpu):
+                # Warps stay together.
+                beyond += wp.where(threads > 1, thread % WARP, 0)
+            elif listed.shape[0] > 0:
+                beyond = listed_count[0] + near.touch_count[0]
             while k < beyond:
-                number = number_of(k, near, all)
+                number = int(-1)
+                if listed.shape[0] == 0:
+                    number = number_of(k, near, all)
+                elif k < listed_count[0]:
+                    number = listed[k]
+                else:
+                    number = all.rigid.first_triangle + near.touches[k - listed_count[0]]
                 may_act = int(0)
                 if number >= 0:
                     may_act = locate(number, dt, all, sums)
+                if wp.static(on_cpu):
+                    if may_act != 0 and are_separate != 0:
+                        for iteration in range(iterations):
+                            correct(number, iteration % 2, dt, all, sums)
                 list_by_warp(sums.live, sums.live_count, number, wp.where(are_separate != 0, 0, may_act))
                 k += threads
         phase = wp.max(first, LOCATE + 1)
-        live = int(0)
-        own = int(-1)
-        mine = Contact()
-        blocks = int(1)
-        while phase <= wp.min(last, iterations):
-            if phase > first and are_separate == 0:
-                if phase == LOCATE + 1:
-                    synchronize_grid(sums.arrived)
-                else:
-                    synchronize_blocks(sums.arrived, 1, blocks)
-            if own < 0:
-                live = wp.where(are_separate != 0, near.count[0], sums.live_count[0])
-                # Only blocks that have any of them wait for one another.
-                blocks = wp.clamp((live + WARP - 1) // WARP, 1, wp.max(threads // BLOCK, 1))
-            k = int(start)
-            if thread // BLOCK >= blocks:
-                phase = iterations
-                live = 0
-            while k < live:
-                number = own
-                contact = mine
-                if k != start or own < 0:
-                    number = sums.live[k]
-                    if are_separate != 0:
-                        number = near.nodes[k]
-                    contact = contact_of(number, dt, all)
-                if contact.acts != OUT:
-                    contact = iterate(contact, (phase - 1) % 2, law, surface, sums)
-                # A thread's first contact stays in registers.
-                if k == start:
-                    own = number
-                    mine = contact
-                else:
-                    keep(number, contact, all)
-                k += threads
-            phase += 1
-        if own >= 0:
-            keep(own, mine, all)
+        if wp.static(on_cpu):
+            while phase <= wp.min(last, iterations) and are_separate == 0:
+                k = int(start)
+                while k < sums.live_count[0]:
+                    if k < records.shape[0]:
+                        correct_listed(k, phase, iterations, dt, all, records, sums)
+                    else:
+                        correct(sums.live[k], (phase - 1) % 2, dt, all, sums)
+                    k += threads
+                phase += 1
+        else:
+            live = int(0)
+            own = int(-1)
+            mine = Contact()
+            blocks = int(1)
+            while phase <= wp.min(last, iterations):
+                if phase > first and are_separate == 0:
+                    if phase == LOCATE + 1:
+                        synchronize_grid(sums.arrived)
+                    else:
+                        synchronize_blocks(sums.arrived, 1, blocks)
+                if own < 0:
+                    live = wp.where(are_separate != 0, near.count[0], sums.live_count[0])
+                    # Only blocks that have any of them wait for one another.
+                    blocks = wp.clamp((live + WARP - 1) // WARP, 1, wp.max(threads // BLOCK, 1))
+                k = int(start)
+                if thread // BLOCK >= blocks:
+                    phase = iterations
+                    live = 0
+                while k < live:
+                    number = own
+                    contact = mine
+                    if k != start or own < 0:
+                        number = sums.live[k]
+                        if are_separate != 0:
+                            number = near.nodes[k]
+                        contact = contact_of(number, dt, all)
+                    if contact.acts != OUT:
+                        contact = iterate(contact, (phase - 1) % 2, all.rigid.law, all.rigid.surface, sums)
+                    # A thread's first contact stays in registers.
+                    if k == start:
+                        own = number
+                        mine = contact
+                    else:
+                        keep(number, contact, all)
+                    k += threads
+                phase += 1
+            if own >= 0:
+                keep(own, mine, all)
         if last > iterations:
             if first < last and are_separate == 0:
                 synchronize_grid(sums.arrived)

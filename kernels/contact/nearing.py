@@ -10,12 +10,12 @@ from warp_corot.kernels.elements.simd8 import on_cpu
 from warp_corot.kernels.modules import INLINED
 from warp_corot.kernels.stepping.pace import Pace
 
+from .approach import Part, Visits, append, choose
 from .bearing import is_borne
+from .explicit_rows import FORESEEN, WAITS
 from .law import Law
 from .motion import Surface, foreseen
 from .rows import Rows, row_count
-from .vertices import FORESEEN, WAITS
-from .visits import Part, Visits, append, choose
 from .watch import FARTHEST, Near, Watch
 
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": INLINED})

@@ -4,16 +4,14 @@ import warp as wp
 
 from warp_corot.kernels.stepping.pace import DT, Pace
 
-from .bearing import is_borne, left_at
-from .carriers import Carriers, crowd_at, is_held_at, motion_at
-from .contact_curvature import Rolling, rolling_of, tilted
+from .bearing import Carriers, crowd_at, is_borne, is_held_at, left_at, motion_at
+from .closest import Rolling, rolling_of, tilted
+from .explicit_rows import CORNER, SKEWERED, near_triangle
 from .implicit_rows import AGAIN, FIRST, MISSING, ImplicitRows, corner_weights, list_row
-from .law import Law, held_back
+from .law import QUARTERED, Law, across, held_back, kept_gap
 from .motion import Motions, Surface
+from .rows import Rows
 from .shapes import CAPSULE, GROUND, SPHERE, Shapes, carried, distance_to
-from .springs import QUARTERED, kept_gap
-from .touches import CORNER, SKEWERED, Touches, nearest
-from .vertices import across
 
 wp.set_module_options({"enable_backward": False})
 
@@ -53,39 +51,22 @@ class Found:
 
 @wp.func
 def find_on_triangle(
-    o: int,
-    pose: wp.transform,
-    a: wp.vec3,
-    b: wp.vec3,
-    c: wp.vec3,
-    far: float,
-    was: wp.vec3,
-    side: wp.vec3,
-    before: wp.vec3,
-    shapes: Shapes,
+    o: int, pose: wp.transform, at: wp.mat33, far: float, was: wp.vec3, side: wp.vec3, before: wp.vec3, shapes: Shapes,
     law: Law,
-):
-    """The point of a triangle that is closest to an obstacle, if that is within reach and closer than the corners.
+):  # fmt: skip
+    """The point of a triangle with the corners ``at`` that is closest to an obstacle, if it is within reach and closer
+    than the corners.
 
     The point with the shares ``before`` stays if it is hardly less close: along an edge of an obstacle all points are
     about as close, and forces that jump between them do not come to rest. On round obstacles it rolls instead.
     """
     found = Found()
     found.is_near = False
-    middle = (a + b + c) / 3.0
-    size = wp.max(wp.length(a - middle), wp.max(wp.length(b - middle), wp.length(c - middle)))
-    most = size + far
-    distance, _away = distance_to(shapes, o, pose, middle, most)
-    if distance > most:
+    is_near, w, gap, n = near_triangle(o, pose, at[0], at[1], at[2], far, was, side, shapes)
+    if not is_near:
         return found
-    w, gap, n = nearest(shapes, o, pose, most, far, a, b, c)
-    if wp.dot(was, was) > 0.0 and wp.dot(n, side) < 0.0 and shapes.kind[o] == CAPSULE:
-        # The axis has passed through since the last time.
-        n = -n
-        gap = -2.0 * shapes.size[o][0] - gap
-    if gap > far or wp.max(w) > CORNER:
-        return found
-    points = wp.matrix_from_rows(a, b, c, before[0] * a + before[1] * b + before[2] * c)
+    most = far + wp.length(at[1] - at[0]) + wp.length(at[2] - at[0])
+    point = before * at
     is_round = shapes.kind[o] == SPHERE or shapes.kind[o] == CAPSULE
     tried = int(3)
     if wp.dot(was, was) > 0.0 and wp.max(before) <= CORNER and not is_round:
@@ -93,27 +74,27 @@ def find_on_triangle(
     # The corners, the former point, and the one where it goes. This loop is not unrolled, so that there is one distance
     # function to compile.
     k = int(0)
-    point = points[0]
     while k < tried:
-        if k < 4:
-            point = points[k]
-        there, away = distance_to(shapes, o, pose, point, most)
-        if k < 3 and there <= gap + CLOSER * law.tolerance:
+        there = point
+        if k < 3:
+            there = at[k]
+        distance, out = distance_to(shapes, o, pose, there, most)
+        if k < 3 and distance <= gap + CLOSER * law.tolerance:
             return found
         if k == 3:
-            beyond = there - gap
+            beyond = distance - gap
             if beyond > STAYS * law.slack:
                 w = before + (1.0 - wp.sqrt(STAYS * law.slack / beyond)) * (w - before)
-                point = w[0] * a + w[1] * b + w[2] * c
+                point = w * at
                 tried = 5
             else:
                 w = before
         if k >= 3:
-            gap = there
-            n = away
+            gap = distance
+            n = out
         k += 1
     found.is_near = True
-    found.rolling = rolling_of(o, pose, w, gap, n, a, b, c, shapes)
+    found.rolling = rolling_of(o, pose, w, gap, n, at[0], at[1], at[2], shapes)
     found.weights = wp.vec4(w[0], w[1], w[2], 0.0)
     found.gap = gap
     found.normal = n
@@ -208,8 +189,8 @@ def take_row(
 
 
 @wp.func
-def locate_triangle(
-    t: int,
+def locate_at(
+    k: int,
     which: int,
     shapes: Shapes,
     motions: Motions,
@@ -218,37 +199,47 @@ def locate_triangle(
     surface: Surface,
     triangles: wp.array[wp.vec3i],
     d: wp.array[wp.vec4],
-    touches: Touches,
+    kept: Rows,
     carriers: Carriers,
     rows: ImplicitRows,
     changed: wp.array[wp.int32],
 ):
-    """Find obstacles at a triangle at the beginning of the step, or after motions d; forces become multipliers.
+    """Find obstacles at a place, or at a triangle, whose numbers follow, at the beginning of the step or after motions
+    d; forces become multipliers.
 
     If a motion is fast, its path may lead through the obstacle, so the row stays where the step begins.
     """
-    corners = triangles[t]
+    is_place = k < surface.node.shape[0]
+    first = int(k)
+    stride = surface.node.shape[0]
+    corners = wp.vec3i(k, -1, -1)
+    if not is_place:
+        first = rows.first_triangle + k - stride
+        corners = triangles[k - stride]
+        stride = triangles.shape[0]
     if which == FIRST:
         for o in range(shapes.kind.shape[0]):
-            rows.listed[rows.first_triangle + o * triangles.shape[0] + t] = 0
-    if corners[0] < 0:
+            rows.listed[first + o * stride] = 0
+    if corners[0] < 0 or (is_place and (surface.node[k] < 0 or is_held_at(k, surface, carriers))):
         return
     world = surface.world[corners[0]]
     way = float(0.0)
     x = wp.mat33()
     e = wp.mat33()
-    for k in range(3):
-        e[k] = motion_at(corners[k], surface, carriers, d)
-        x[k] = surface.x[corners[k]]
-        way = wp.max(way, wp.length(e[k]))
+    for m in range(3):
+        if corners[m] >= 0:
+            e[m] = motion_at(corners[m], surface, carriers, d)
+            x[m] = surface.x[corners[m]]
+            way = wp.max(way, wp.length(e[m]))
+    middle = wp.where(is_place, x[0], (x[0] + x[1] + x[2]) / 3.0)
+    longest = wp.max(wp.length(x[0] - x[1]), wp.max(wp.length(x[1] - x[2]), wp.length(x[2] - x[0])))
     for o in range(shapes.kind.shape[0]):
-        r = rows.first_triangle + o * triangles.shape[0] + t
+        r = first + o * stride
         if which == FIRST:
-            rows.force[r] = touches.force[o, t]
-            rows.normal[r] = touches.normal[o, t]
-            before = touches.shares[o, t]
-            rows.weights[r] = wp.vec4(before[0], before[1], before[2], 0.0)
-        if shapes.kind[o] == GROUND or (which == MISSING and rows.listed[r] != 0):
+            rows.force[r] = kept.force[r]
+            rows.normal[r] = kept.normal[r]
+            rows.weights[r] = kept.weights[r]
+        if (not is_place and shapes.kind[o] == GROUND) or (which == MISSING and rows.listed[r] != 0):
             continue
         now = motions.now[world, o]
         later = motions.later[world, o]
@@ -259,88 +250,40 @@ def locate_triangle(
         if is_at_end:
             pose = later
             at = x + e
-        middle = (x[0] + x[1] + x[2]) / 3.0
         far = 2.0 * way + wp.length(carried(now, later, middle)) + 2.0 * law.tolerance
         was = rows.force[r]
-        before = corner_weights(r, rows)
-        found = find_on_triangle(o, pose, at[0], at[1], at[2], far, was, rows.normal[r], before, shapes, law)
-        is_late = which == AGAIN and rows.solves[0] >= QUARTERED
-        if is_late and is_at_end and found.is_near and rows.listed[r] != 0:
-            found = halfway(r, found, e, rows)
+        found = Found()
+        if is_place:
+            if wp.length_sq(was) > 0.0:
+                # What a small gap has left of the last force still pushes.
+                far += 4.0 * law.slack
+            gap, n = distance_to(shapes, o, pose, at[0], far)
+            found.is_near = gap <= far
+            found.weights = wp.vec4(1.0, 0.0, 0.0, 0.0)
+            found.gap = gap
+            found.normal = n
+        else:
+            found = find_on_triangle(o, pose, at, far, was, rows.normal[r], corner_weights(r, rows), shapes, law)
+            is_late = which == AGAIN and rows.solves[0] >= QUARTERED
+            if is_late and is_at_end and found.is_near and rows.listed[r] != 0:
+                found = halfway(r, found, e, rows)
         w = wp.vec3(found.weights[0], found.weights[1], found.weights[2])
         found.moved = carried(now, later, w * x)
         slip = w * e - found.moved
         found.opened = wp.dot(found.normal, slip)
         found.is_at_end = is_at_end
-        if not is_at_end:
-            found.rolling.distance = 0.0
-        if found.is_near and found.rolling.distance > 0.0:
-            found.tilt = tilted(found.rolling, w, found.normal, e)
-        found.allowed = ALLOWED * thickness
-        longest = wp.max(wp.length(x[0] - x[1]), wp.max(wp.length(x[1] - x[2]), wp.length(x[2] - x[0])))
-        if is_borne(corners[0], surface) and longest > WIDE * thickness:
-            found.allowed = 0.0
         found.friction = shapes.friction[o]
-        if found.gap < -SKEWERED * thickness - found.allowed:
-            found.friction = 0.0
+        if not is_place:
+            if not is_at_end:
+                found.rolling.distance = 0.0
+            elif found.is_near and found.rolling.distance > 0.0:
+                found.tilt = tilted(found.rolling, w, found.normal, e)
+            if not is_borne(corners[0], surface) or longest <= WIDE * thickness:
+                found.allowed = ALLOWED * thickness
+            if found.gap < -SKEWERED * thickness - found.allowed:
+                found.friction = 0.0
         places = wp.vec4i(corners[0], corners[1], corners[2], -1)
         take_row(r, which, found, slip, places, law, pace, surface, carriers, rows, changed)
-
-
-@wp.func
-def locate_place(
-    s: int,
-    which: int,
-    shapes: Shapes,
-    motions: Motions,
-    law: Law,
-    pace: Pace,
-    surface: Surface,
-    d: wp.array[wp.vec4],
-    forces: wp.array2d[wp.vec3],
-    carriers: Carriers,
-    rows: ImplicitRows,
-    changed: wp.array[wp.int32],
-):
-    """The same at a place; nothing sinks in there."""
-    if which == FIRST:
-        for o in range(shapes.kind.shape[0]):
-            rows.listed[o * surface.node.shape[0] + s] = 0
-    if surface.node[s] < 0 or is_held_at(s, surface, carriers):
-        return
-    world = surface.world[s]
-    x = surface.x[s]
-    e = motion_at(s, surface, carriers, d)
-    way = wp.length(e)
-    for o in range(shapes.kind.shape[0]):
-        r = o * surface.node.shape[0] + s
-        if which == FIRST:
-            rows.force[r] = forces[o, s]
-        if which == MISSING and rows.listed[r] != 0:
-            continue
-        now = motions.now[world, o]
-        later = motions.later[world, o]
-        found = Found()
-        found.is_at_end = which != FIRST and way <= NEAR_END * shapes.thickness[o]
-        pose = now
-        at = x
-        if found.is_at_end:
-            pose = later
-            at = x + e
-        found.moved = carried(now, later, x)
-        far = 2.0 * way + wp.length(found.moved) + 2.0 * law.tolerance
-        if wp.length_sq(rows.force[r]) > 0.0:
-            # What a small gap has left of the last force still pushes.
-            far += 4.0 * law.slack
-        gap, n = distance_to(shapes, o, pose, at, far)
-        found.is_near = gap <= far
-        found.weights = wp.vec4(1.0, 0.0, 0.0, 0.0)
-        found.gap = gap
-        found.normal = n
-        found.opened = wp.dot(n, e - found.moved)
-        found.friction = shapes.friction[o]
-        places = wp.vec4i(s, -1, -1, -1)
-        take_row(r, which, found, e - found.moved, places, law, pace, surface, carriers, rows, changed)
 
 
 @wp.kernel(enable_backward=False)
@@ -355,8 +298,7 @@ def locate_obstacles(
     surface: Surface,
     triangles: wp.array[wp.vec3i],
     d: wp.array[wp.vec4],
-    forces: wp.array2d[wp.vec3],
-    touches: Touches,
+    kept: Rows,
     going: wp.array[wp.int32],
     # In and out
     carriers: Carriers,
@@ -365,17 +307,11 @@ def locate_obstacles(
     changed: wp.array[wp.int32],
 ):
     """Find obstacles at all places, and at triangles if there are rows for them; missing ones only if no solve is
-    ``going`` to follow."""
+    ``going`` to follow. ``kept``: the rows of the last step."""
     k = wp.tid()
-    places = surface.node.shape[0]
-    count = places
+    count = surface.node.shape[0]
     if rows.first_pair > rows.first_triangle:
         count += triangles.shape[0]
     while k < count and not is_done(which, going, rows):
-        if k < places:
-            locate_place(k, which, shapes, motions, law, pace, surface, d, forces, carriers, rows, changed)
-        else:
-            locate_triangle(
-                k - places, which, shapes, motions, law, pace, surface, triangles, d, touches, carriers, rows, changed
-            )
+        locate_at(k, which, shapes, motions, law, pace, surface, triangles, d, kept, carriers, rows, changed)
         k += threads

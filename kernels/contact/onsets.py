@@ -5,7 +5,7 @@ import warp as wp
 from warp_corot.kernels.elements.elements import load_node
 from warp_corot.kernels.stepping.pace import DT, Pace
 
-from .carriers import Carriers, is_held_at
+from .bearing import Carriers, is_held_at
 from .law import Law
 from .locate import locate_facing
 from .motion import Motions, Surface
@@ -101,7 +101,7 @@ def find_pair_onsets(
         force = rows.force[row]
         if wp.dot(force, force) == 0.0 and locate_facing(row, surface, meeting, rows):
             p = rows.places[row]
-            w = rows.shares[row]
+            w = rows.weights[row]
             closing = wp.vec3()
             for k in range(4):
                 closing += w[k] * surface.d[p[k]]

@@ -4,15 +4,12 @@ import warp as wp
 
 from warp_corot.kernels.stepping.pace import DT, Pace
 
-from .bearing import left_at
-from .carriers import Carriers, crowd_at, gone_at, is_held_at, motion_at
+from .bearing import Carriers, crowd_at, gone_at, is_held_at, left_at, motion_at
 from .implicit_rows import AGAIN, FIRST, REPEATED, ImplicitRows, list_row, opened_by
-from .law import Law, held_back
+from .law import Law, across, held_back, kept_gap, least_gap
 from .locate import locate_facing
 from .motion import Surface
 from .rows import Meeting, Rows, row_count
-from .springs import kept_gap, least_gap
-from .vertices import across
 from .watch import Watch, wake
 
 wp.set_module_options({"enable_backward": False})
@@ -98,7 +95,7 @@ def locate(
     # For pairs that are located again before the first solve.
     rows.force[r] = wp.where(which != AGAIN, was, wp.vec3())
     p = pairs.places[k]
-    w = pairs.shares[k]
+    w = pairs.weights[k]
     is_free = bool(False)
     given = wp.vec3()
     if is_near:

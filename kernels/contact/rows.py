@@ -1,7 +1,8 @@
-"""Soft surfaces that may touch, and their pairs that are near each other.
+"""Rows of contact: an obstacle at a place, an obstacle at a triangle, or a pair of soft surfaces, which is a node at a
+triangle, or two edges.
 
-A row is a pair of a node and a triangle, or of two edges: four nodes with weights, positive on the first side and
-negative on the second, so that the sum of weights times positions is the vector from the second side to the first.
+A row has up to four places with weights, positive on the first side and negative on the second, so that the sum of
+weights times positions is the vector from the second side to the first.
 """
 
 import warp as wp
@@ -40,21 +41,27 @@ class Meeting:
 
 @wp.struct
 class Rows:
-    """Near pairs, [P], sorted by the first item, a node or an edge of S + E, and then by the second."""
+    """Contacts that there may be, [R], and what steps keep of them.
 
-    total: wp.array[wp.int32]  # [1] how many there are, or were if there were room
+    Those of obstacles are numbered S for each obstacle, and then T for each obstacle. The near pairs of soft surfaces
+    are a table of their own, sorted by the first item, a node or an edge of S + E, and then by the second.
+    """
+
+    weights: wp.array[wp.vec4]  # of the places, positive on the first side; zero where nothing is near
+    normal: wp.array[wp.vec3]  # from the second side to the first, out of an obstacle
+    gap: wp.array[wp.float32]  # [m]
+    moved: wp.array[wp.vec3]  # motion of the obstacle's point in this step, and of that back to an anchor [m]
+    friction: wp.array[wp.float32]
+    acts: wp.array[wp.int32]  # see ``mass_split``
+    force: wp.array[wp.vec3]  # on the first side [N]
+    more: wp.array[wp.vec3]  # its change in the last iteration [N]
+    places: wp.array[wp.vec4i]  # of pairs
+    total: wp.array[wp.int32]  # [1] how many pairs there are, or were if there were room
     starts: wp.array[wp.int32]  # [S + E]
     counts: wp.array[wp.int32]  # [S + E]
     owner: wp.array[wp.int32]  # the node, or S and the edge; -1 for none
     other: wp.array[wp.int32]  # the triangle, or the edge
-    places: wp.array[wp.vec4i]
-    shares: wp.array[wp.vec4]
-    normal: wp.array[wp.vec3]  # from the second to the first
-    gap: wp.array[wp.float32]
     away: wp.array[wp.float32]  # how far the two were apart at the last search, at least [m]; empty on CUDA
-    acts: wp.array[wp.int32]  # see ``mass_split``
-    force: wp.array[wp.vec3]  # on the first [N]
-    more: wp.array[wp.vec3]  # its change in the last iteration
 
 
 @wp.struct

@@ -8,13 +8,23 @@ from warp_corot.kernels.modules import INLINED, unique_kernel
 from warp_corot.kernels.stepping.threads import lanes_with, of_first_lane, sum_before, synchronize_warp
 
 from .bearing import share_bearers
-from .boxes import edge_reach, lower_end, triangle_reach, triangle_size, upper_end
 from .closest import on_segments, on_triangle, point_of
 from .locate import BORDER, ENDS, FACING, edge_normal, node_faces_at_rest
 from .motion import Surface
 from .rows import BAND, BAND_AT_REST, Meeting, OldRows, Rows
 from .watch import CRUSHED, PAIRED, Near, Watch, ahead_at, mark
-from .wide_tree import BLUNT, MAY_FACE, NEARLY, WideTree, query_wide
+from .wide_tree import (
+    BLUNT,
+    MAY_FACE,
+    NEARLY,
+    WideTree,
+    edge_reach,
+    lower_end,
+    query_wide,
+    triangle_reach,
+    triangle_size,
+    upper_end,
+)
 
 wp.set_module_options({"enable_backward": False})
 

@@ -4,12 +4,11 @@ import warp as wp
 
 from warp_corot.kernels.stepping.balance import sum_of_lanes
 
+from .explicit_rows import Rigid
 from .mass_split import force_of, grains_of
 from .motion import Motions, Surface
 from .rows import Rows, row_count
 from .shapes import Shapes, distance_to
-from .touches import Touches
-from .vertices import Rigid
 
 wp.set_module_options({"enable_backward": False})
 
@@ -146,58 +145,37 @@ def measure_gaps(
 
 
 @wp.kernel(enable_backward=False)
-def find_depths(shapes: Shapes, motions: Motions, surface: Surface, depths: wp.array[wp.float32]):
-    """Find the depth of each node inside obstacles [m], zero outside."""
-    s = wp.tid()
-    if surface.node[s] < 0 or surface.yielding[s] == 0.0:
-        return
-    deepest = float(0.0)
-    for o in range(shapes.kind.shape[0]):
-        gap, _n = distance_to(shapes, o, motions.later[surface.world[s], o], surface.x[s], 1.0e-3)
-        deepest = wp.max(deepest, -gap)
-    depths[s] = deepest
-
-
-@wp.kernel(enable_backward=False)
 def share_touches(
     # In
     corner_starts: wp.array[wp.int32],
     corners: wp.array[wp.int32],
-    touches: Touches,
-    forces: wp.array2d[wp.vec3],
+    triangles: int,
+    rigid: Rigid,
     # Out
     totals: wp.array2d[wp.vec3],
 ):
     """Add the forces of obstacles on nodes and the nodes' shares of the forces on triangles [N]."""
     o, s = wp.tid()
-    total = forces[o, s]
+    total = rigid.rows.force[o * rigid.surface.node.shape[0] + s]
     for k in range(corner_starts[s], corner_starts[s + 1]):
-        t = corners[k] / 3
-        if touches.acts[o, t] != 0:
-            total += touches.shares[o, t][corners[k] % 3] * touches.force[o, t]
+        r = rigid.first_triangle + o * triangles + corners[k] / 3
+        if rigid.rows.acts[r] != 0:
+            total += rigid.rows.weights[r][corners[k] % 3] * rigid.rows.force[r]
     totals[o, s] = total
 
 
 @wp.kernel(enable_backward=False)
-def forget_places(
-    # In
-    chosen: wp.array[wp.int32],
-    triangles: wp.array[wp.vec3i],
-    # In and out
-    rigid: Rigid,
-    touches: Touches,
-):
-    """Forget the last step's contact with obstacles, of places and triangles in chosen worlds."""
-    o, k = wp.tid()
-    if k < rigid.forces.shape[1] and rigid.surface.node[k] >= 0 and chosen[rigid.surface.world[k]] != 0:
-        rigid.forces[o, k] = wp.vec3()
-        rigid.anchors[o, k] = wp.vec4()
-        rigid.allowance[o, k] = 0.0
-    if k < touches.force.shape[1]:
-        corner = triangles[k][0]
-        if corner >= 0 and chosen[rigid.surface.world[corner]] != 0:
-            touches.force[o, k] = wp.vec3()
-            touches.allowance[o, k] = 0.0
+def forget_rows(chosen: wp.array[wp.int32], triangles: wp.array[wp.vec3i], rigid: Rigid):
+    """Forget the last step's contact with obstacles in chosen worlds."""
+    r = wp.tid()
+    s = r % rigid.surface.node.shape[0]
+    if r >= rigid.first_triangle:
+        s = triangles[(r - rigid.first_triangle) % triangles.shape[0]][0]
+    if s >= 0 and rigid.surface.node[s] >= 0 and chosen[rigid.surface.world[s]] != 0:
+        rigid.rows.force[r] = wp.vec3()
+        rigid.allowance[r] = 0.0
+        if r < rigid.first_triangle:
+            rigid.anchors[r] = wp.vec4()
 
 
 @wp.kernel(enable_backward=False)
@@ -206,8 +184,8 @@ def add_pairs(grain: float, rows: Rows, forces: wp.array[wp.vec3l]):
     row = wp.tid()
     if row < row_count(rows) and rows.acts[row] != 0:
         for k in range(4):
-            if rows.shares[row][k] != 0.0:
-                wp.atomic_add(forces, rows.places[row][k], grains_of(rows.shares[row][k] * rows.force[row], grain))
+            if rows.weights[row][k] != 0.0:
+                wp.atomic_add(forces, rows.places[row][k], grains_of(rows.weights[row][k] * rows.force[row], grain))
 
 
 @wp.kernel(enable_backward=False)

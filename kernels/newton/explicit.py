@@ -29,8 +29,7 @@ a fraction of the margin, to keep cloth apart.
 import warp as wp
 
 from warp_corot.kernels.contact.closest import on_triangle
-from warp_corot.kernels.contact.law import held_back
-from warp_corot.kernels.contact.vertices import across
+from warp_corot.kernels.contact.law import across, held_back
 
 from .particles import TOO_MANY_PAIRS, Bodies, Particles, is_fixed, mark
 from .rows import (

@@ -23,8 +23,7 @@ from typing import Any
 
 import warp as wp
 
-from warp_corot.kernels.contact.springs import LOOSE, bound_of
-from warp_corot.kernels.contact.vertices import across
+from warp_corot.kernels.contact.law import LOOSE, across, bound_of
 from warp_corot.kernels.corotated.tangent import keep_gradients
 from warp_corot.kernels.elements.constitutive import hooke, symmetric
 from warp_corot.kernels.elements.elements import GeneralElements, add_force, load_node, store_node

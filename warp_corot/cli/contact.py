@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from warp_corot.contact.options import Contact, checked_friction
-from warp_corot.contact.shapes import Box, Capsule, Cylinder, Ground, Shape, Sphere
+from warp_corot.contact.shapes import Box, Capsule, Cylinder, Ground, Shape, Sphere, axis_of
 from warp_corot.contact.skin import own_surface
 from warp_corot.contact.tool import Obstacle, Tool
 from warp_corot.cutting.blade import Blade
@@ -285,9 +285,7 @@ def say_reach(bodies: Sequence[RunBody], sim: Simulation) -> None:
 def _described(obstacle: Obstacle) -> str:
     shape = obstacle.shape if isinstance(obstacle, Tool) else obstacle
     if isinstance(shape, Ground):
-        x, y, z, w = shape.quaternion
-        normal = np.array([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)])
-        return f"at {float(normal @ shape.position) + 0.0:.4g} m"
+        return f"at {float(axis_of(shape.quaternion) @ shape.position) + 0.0:.4g} m"
     moves = isinstance(obstacle, Tool) and obstacle.keys is not None
     sizes = ", ".join(length(size) for size in shape.size if size > 0.0)
     return f"{shape!r} ({sizes}), {'moves along its path' if moves else 'stays where it is'}"

@@ -76,15 +76,13 @@ class CarriedForces:
         self._rest = surface.arrays.rest.numpy()
         self._starts = surface.count, surface.triangle_count, surface.edge_count
         self._loaded = [np.zeros(count, bool) for count in self._starts[:2]]
-        self._rigid: dict[str, npt.NDArray[np.float32]] = {}
+        self._rigid: dict[str, tuple[Floats, Floats]] = {}
         if rigid is not None:
-            kept = {"anchors": rigid.anchors, "forces": rigid.forces}
-            kept |= {"touches": rigid.touches.force, "normals": rigid.touches.normal}
-            kept |= {"allowances": rigid.allowances, "of_touches": rigid.touches.allowance}
-            self._rigid = {name: array.numpy().copy() for name, array in kept.items()}
-            self._loaded[0] |= self._rigid["anchors"].any(axis=(0, 2)) | self._rigid["forces"].any(axis=(0, 2))
+            self._rigid = {name: rigid.parts(name) for name in rigid.state}
+            places, triangles = self._rigid["force"]
+            self._loaded[0] |= self._rigid["anchors"][0].any(axis=(0, 2)) | places.any(axis=(0, 2))
             if rigid.have_edges:
-                self._loaded[1] |= self._rigid["touches"].any(axis=(0, 2))
+                self._loaded[1] |= triangles.any(axis=(0, 2))
         self._rows = (np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 3), np.float32))
         if pairs is not None:
             self._take_rows(pairs)
@@ -150,31 +148,23 @@ class CarriedForces:
 
     def _give_rigid(self, rigid: RigidForces, found: _Moved) -> None:
         same, stays = (np.flatnonzero(each & (found.places >= 0)) for each in (found.is_same, found.stays))
-        anchors, forces = (
-            np.zeros((*array.shape, 4 - k), np.float32) for k, array in enumerate((rigid.anchors, rigid.forces))
-        )
-        anchors[:, found.places[same]] = self._rigid["anchors"][:, same]
-        rigid.anchors.assign(anchors)
-        _add(forces, found.places, self._rigid["forces"])
-        rigid.forces.assign(forces)
-        allowances = np.full(rigid.allowances.shape, UNKNOWN, np.float32)
-        allowances[:, found.places[stays]] = self._rigid["allowances"][:, stays]
-        rigid.allowances.assign(allowances)
-        if not rigid.have_edges:
-            return
-        force, normal = (np.zeros((*rigid.touches.force.shape, 3), np.float32) for _ in range(2))
-        _add(force, found.triangles, self._rigid["touches"])
         there = np.flatnonzero(found.triangles >= 0)
-        normal[:, found.triangles[there]] = self._rigid["normals"][:, there]
-        rigid.touches.force.assign(force)
-        rigid.touches.normal.assign(normal)
-        corners = self._surface.triangles.numpy()
-        moves = np.full(self._surface.count, True)
-        moves[found.places[stays]] = False
-        fresh = np.full(rigid.touches.allowance.shape, UNKNOWN, np.float32)
-        stays = there[found.triangle_stays[there] & ~moves[corners[found.triangles[there]]].any(axis=1)]
-        fresh[:, found.triangles[stays]] = self._rigid["of_touches"][:, stays]
-        rigid.touches.allowance.assign(fresh)
+        now, former, surface = {name: rigid.parts(name) for name in rigid.state}, self._rigid, self._surface
+        for name, parts in now.items():
+            for part in parts:
+                part[:] = UNKNOWN if name == "allowance" else 0.0
+        now["anchors"][0][:, found.places[same]] = former["anchors"][0][:, same]
+        _add(now["force"][0], found.places, former["force"][0])
+        now["allowance"][0][:, found.places[stays]] = former["allowance"][0][:, stays]
+        if rigid.have_edges:
+            _add(now["force"][1], found.triangles, former["force"][1])
+            now["normal"][1][:, found.triangles[there]] = former["normal"][1][:, there]
+            moves = np.full(surface.count, True)
+            moves[found.places[stays]] = False
+            corners = surface.triangles.numpy()
+            stays = there[found.triangle_stays[there] & ~moves[corners[found.triangles[there]]].any(axis=1)]
+            now["allowance"][1][:, found.triangles[stays]] = former["allowance"][1][:, stays]
+        rigid.assign(now)
 
     # --- forces between soft surfaces --------------------------------------------------------------------------------
 

@@ -8,15 +8,13 @@ import numpy as np
 import warp as wp
 
 from warp_corot.kernels.contact import bearing, onsets
-from warp_corot.kernels.contact import carriers as of_carriers
 from warp_corot.kernels.contact import implicit_rows as kernels
-from warp_corot.kernels.contact.contact_curvature import Rolling
+from warp_corot.kernels.contact.closest import Rolling
 from warp_corot.kernels.contact.law import Law
 from warp_corot.kernels.contact.motion import Surface
 from warp_corot.kernels.contact.obstacle_rows import locate_obstacles
 from warp_corot.kernels.contact.pair_rows import find_strays, locate_pairs
 from warp_corot.kernels.contact.rows import Meeting, Rows
-from warp_corot.kernels.contact.touches import Touches
 from warp_corot.kernels.implicit.assembled import Couplings
 from warp_corot.solvers.implicit.operator import Springs
 from warp_corot.solvers.system import System
@@ -105,7 +103,7 @@ class ImplicitContact:
         for fields, size in ((OF_ROWS, self._length), (OF_TRIANGLES, triangles), (OF_PAIRS, room)):
             for name, dtype in fields.items():
                 setattr(rows, name, self._zeros(size, dtype))
-        self._carriers = of_carriers.Carriers()
+        self._carriers = bearing.Carriers()
         for name, dtype in {"entry": wp.int32, "compliance": wp.float32, "gone": wp.vec3}.items():
             setattr(self._carriers, name, self._zeros(carriers, dtype))
         self._carriers.crowd = self._zeros((2, carriers), wp.float32)
@@ -193,7 +191,7 @@ class ImplicitContact:
         start, offset, count, own = self._nodes_of(k)
         inputs = [start, offset, first, body.conditions.inverse_mass, blocks]
         inputs += [body.state.rest, body.state.displacements, increment, guess]
-        wp.launch(of_carriers.begin_carriers, count, inputs, [own, self._carriers], device=self.device)
+        wp.launch(bearing.begin_carriers, count, inputs, [own, self._carriers], device=self.device)
         self._launch_places(k)
 
     def launch_first(self, offset: int, d: wp.array) -> None:
@@ -282,17 +280,15 @@ class ImplicitContact:
 
     def launch_end(self, d: wp.array) -> None:
         """Launch the update of what users read about contact, and of whether a new search is due."""
-        surface, forces, touches = self._surface, self._zeros((0, 0), wp.vec3), Touches()
-        if self._rigid is not None:
-            forces, touches = self._rigid.forces, self._rigid.touches
+        surface, beside = self._surface, Rows() if self._rigid is None else self._rigid.rows
         self.update(d)
-        self._launch(kernels.end_rows, self._length, [self._rows, forces, touches, self._of_pairs[1], self._added])
+        self._launch(kernels.end_rows, self._length, [self._rows, beside, self._of_pairs[1], self._added])
         inputs = [d, self._carriers, self._added, surface.arrays]
         wp.launch(kernels.end_places, surface.count, inputs, device=self.device)
         for k, body in enumerate(self._system.bodies):
             start, _, count, own = self._nodes_of(k)
             inputs = [start, int(surface.parts[k].bearers > 0), own, surface.arrays]
-            wp.launch(of_carriers.end_carriers, count, inputs, [body.state.contact_forces], device=self.device)
+            wp.launch(bearing.end_carriers, count, inputs, [body.state.contact_forces], device=self.device)
         if self._pairs is not None:
             self._pairs.search.launch_after()
 
@@ -327,7 +323,7 @@ class ImplicitContact:
         assert self._rigid is not None
         surface, rigid, obstacles, pace = self._surface, self._rigid, self._obstacles, self._system.pace.arrays
         inputs = [int(which), obstacles.shapes, obstacles.motions, self._law, pace, surface.arrays]
-        inputs += [surface.triangles, d, rigid.forces, rigid.touches, going, self._carriers, self._rows, self.changed]
+        inputs += [surface.triangles, d, rigid.rows, going, self._carriers, self._rows, self.changed]
         self._launch(locate_obstacles, self._items, inputs, most=self._items)
 
     @property

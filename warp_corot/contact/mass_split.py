@@ -10,12 +10,10 @@ import warp as wp
 from warp_corot.inputs.cpu_threads import Regions, Team, launch
 from warp_corot.kernels.contact import approach, nearing, sums
 from warp_corot.kernels.contact import mass_split as kernels
+from warp_corot.kernels.contact.approach import Part, Visits
+from warp_corot.kernels.contact.explicit_rows import Rigid
 from warp_corot.kernels.contact.law import Law
 from warp_corot.kernels.contact.rows import Meeting, Rows
-from warp_corot.kernels.contact.sweep import sweeper
-from warp_corot.kernels.contact.touches import Touches
-from warp_corot.kernels.contact.vertices import Rigid
-from warp_corot.kernels.contact.visits import Part, Visits
 from warp_corot.kernels.contact.watch import Near
 from warp_corot.kernels.stepping.pace import Pace
 from warp_corot.kernels.stepping.threads import LINE
@@ -44,12 +42,8 @@ def solver_of(
     device: wp.Device, obstacles: Sequence[Obstacle], options: Contact, bodies: int
 ) -> tuple[wp.Kernel, int | None]:
     """The kernel of a step, for what may touch, and its threads of a block."""
-    kernel = _compiled(device, have_edges(obstacles), may_meet(bodies, options))
+    kernel = kernels.solver(have_edges(obstacles), may_meet(bodies, options), device.is_cpu)
     return kernel, BLOCK if device.is_cuda else None
-
-
-def _compiled(device: wp.Device, has_triangles: bool, has_pairs: bool) -> wp.Kernel:
-    return (kernels.solver if device.is_cuda else sweeper)(has_triangles, has_pairs)
 
 
 class MassSplit:
@@ -88,7 +82,8 @@ class MassSplit:
         alone = pairs is None and not surface.is_borne and (rigid is None or rigid.is_separate)
         self._none = wp.zeros(0, dtype=wp.int32, device=self.device)
         self._are_separate, self.iterations = alone, EXACT if alone else ITERATIONS
-        self._kernel = _compiled(self.device, rigid is not None and rigid.have_edges, pairs is not None)
+        has_triangles = rigid is not None and rigid.have_edges
+        self._kernel = kernels.solver(has_triangles, pairs is not None, self.device.is_cpu)
         self.follow()
 
     def follow(self) -> None:
@@ -102,10 +97,9 @@ class MassSplit:
         self.sums.touched = wp.zeros(count, dtype=wp.int32, device=device)
         self.sums.weights = wp.zeros((2, count), dtype=wp.int32, device=device)
         self.sums.forces = wp.zeros((2, count), dtype=wp.vec3l, device=device)
-        self._at_places = self._at_triangles = 0
-        if self._rigid is not None:
-            self._at_places, self._at_triangles = self._rigid.forces.size, self._rigid.touches.force.size
-        contacts = self._at_places + self._at_triangles + room
+        #: The number of the first pair among contacts.
+        self.first_pair = 0 if self._rigid is None else len(self._rigid.rows.force)
+        contacts = self.first_pair + room
         self.sums.live = wp.zeros(contacts, dtype=wp.int32, device=device)
         self.sums.live_count = wp.zeros(2, dtype=wp.int32, device=device)
         self.sums.arrived = wp.zeros(2 * int(LINE), dtype=wp.uint32, device=device)
@@ -127,11 +121,6 @@ class MassSplit:
     def buffer(self) -> int:
         """The buffer of the sums that has the forces at the end of a step."""
         return self.iterations % 2
-
-    @property
-    def first_pair(self) -> int:
-        """The number of the first pair among contacts."""
-        return self._at_places + self._at_triangles
 
     def first(self, k: int) -> int:
         """The number in the sums of the first node that carries a body's surface."""
@@ -178,26 +167,27 @@ class MassSplit:
         wp.launch(sums.place_forces, self.surface.count, inputs, [arrays], device=self.device, block_dim=BLOCK)
 
     def _launch(self, near: Near, first: int, last: int, part: int) -> None:
-        contacts = kernels.Contacts()
-        contacts.first_triangle, contacts.first_pair = self._at_places, self.first_pair
-        contacts.triangles, contacts.touches = self.surface.triangles, Touches()
-        if self._rigid is not None:
-            contacts.rigid, contacts.touches = self._rigid.arrays, self._rigid.touches
-        else:
-            contacts.rigid = Rigid()
-            contacts.rigid.surface, contacts.rigid.law = self.surface.arrays, self._law
-        contacts.meeting, contacts.rows = Meeting(), Rows()
-        if self._pairs is not None:
-            contacts.meeting, contacts.rows = self._pairs.meeting, self._pairs.rows
-        search = self._search
-        inputs: list = [first, last, self.iterations, int(self._are_separate), search.watch.awake, near, self._pace]
-        outputs = [contacts, self.sums]
+        contacts, pairs = kernels.Contacts(), self._pairs
+        contacts.first_pair, contacts.triangles = self.first_pair, self.surface.triangles
+        contacts.rigid = rigid_of(self._rigid, self.surface, self._law)
+        contacts.meeting, contacts.pairs = (Meeting(), Rows()) if pairs is None else (pairs.meeting, pairs.rows)
+        inputs: list = [self._threads, part, first, last, self.iterations, int(self._are_separate)]
+        inputs += [self._search.watch.awake, near, *self._listed, self._pace]
+        outputs = [contacts, self._records, self.sums]
         if self.device.is_cpu:
-            inputs = [self._threads, part, *inputs[:-1], *self._listed, inputs[-1]]
-            launch(self._kernel, 1, inputs, [contacts, self._records, self.sums], device=self.device)
+            launch(self._kernel, 1, inputs, outputs, device=self.device)
         else:
-            dim, block = self._threads, min(self._threads, BLOCK)
-            wp.launch(self._kernel, dim, [dim, *inputs], outputs, device=self.device, block_dim=block)
+            block = min(self._threads, BLOCK)
+            wp.launch(self._kernel, self._threads, inputs, outputs, device=self.device, block_dim=block)
+
+
+def rigid_of(rigid: RigidForces | None, surface: ContactSurface, law: Law) -> Rigid:
+    """Contact with obstacles as a struct for kernels; without them only the surfaces and the law."""
+    if rigid is not None:
+        return rigid.arrays
+    made = Rigid()
+    made.surface, made.law = surface.arrays, law
+    return made
 
 
 # --- steps of the CPU that visit only what may touch ------------------------------------------------------------------
@@ -252,7 +242,7 @@ class Approach:
         if self.is_outdated:
             self._taken = (surface.revision, room)
             places, bodies, carriers = surface.count, len(surface.parts), surface.count + surface.bearer_count
-            touches = 0 if self._rigid is None else self._rigid.touches.force.size
+            touches = 0 if self._rigid is None else self._rigid.touch_count
             bearing, visits = surface.arrays.bearing, Visits()
             visits.entries = wp.zeros(len(bearing.bearers), dtype=wp.vec4i, device=device)
             floats = {"ways": carriers, "needs": carriers, "until": len(bearing.places), "spans": places}
@@ -293,7 +283,9 @@ class Approach:
         """
         system, watch, visits = self._system, self._search.watch, self._visits
         inputs = [self._obstacles.motions, system.pace.arrays, system.bodies[0].conditions.world_starts, offset]
-        wp.launch(approach.begin_visits, 1, [*inputs, self._touches], [watch, self.here, visits], device=self._device)
+        wp.launch(
+            approach.begin_visits, 1, [*inputs, self._rigid_arrays], [watch, self.here, visits], device=self._device
+        )
         if len(system.constraints) > 1:  # which add to them
             self._clear()
         if self._rigid is not None:
@@ -320,8 +312,10 @@ class Approach:
     # --- pieces ----------------------------------------------------------------------------------------------------
 
     @property
-    def _touches(self) -> Touches:
-        return Touches() if self._rigid is None else self._rigid.touches
+    def _rigid_arrays(self) -> Rigid:
+        rigid = rigid_of(self._rigid, self._surface, self._law)
+        rigid.motions = self._obstacles.motions
+        return rigid
 
     def _part(self, k: int, damping: float) -> Part:
         """The surface of the k-th body, as a struct for approach."""
@@ -377,9 +371,8 @@ class Approach:
     def _act(self, offset: int, damping: float, accounts: list[wp.array] | None) -> None:
         """Launch the contact of a step in which anything is due."""
         threads, watch, pace = self._regions.team.parts, self._search.watch, self._system.pace.arrays
-        has_edges, rigid = int(self._rigid is not None and self._rigid.have_edges), Rigid()
-        rigid.surface, rigid.motions, rigid.law = self._surface.arrays, self._obstacles.motions, self._law
-        outputs = [rigid if self._rigid is None else self._rigid.arrays, self._visits, self.here]
+        has_edges = int(self._rigid is not None and self._rigid.have_edges)
+        outputs = [self._rigid_arrays, self._visits, self.here]
         last = int(approach.LIMIT)
         spans = [(0, last)] if threads == 1 else [(phase, phase) for phase in range(last + 1)]
         for k in range(len(self._system.bodies)):

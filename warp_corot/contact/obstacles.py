@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -10,11 +11,12 @@ import warp as wp
 
 from warp_corot.errors import InputError
 from warp_corot.kernels.contact import motion as kernels
-from warp_corot.kernels.contact import sums, touches
+from warp_corot.kernels.contact import sums
+from warp_corot.kernels.contact.explicit_rows import Rigid
 from warp_corot.kernels.contact.law import Law
+from warp_corot.kernels.contact.rows import Rows
 from warp_corot.kernels.contact.shapes import Shapes
 from warp_corot.kernels.contact.sums import measure_gaps
-from warp_corot.kernels.contact.vertices import Rigid
 from warp_corot.kernels.contact.watch import Watch, move_obstacles
 from warp_corot.solvers.system import System
 
@@ -27,6 +29,13 @@ from .tool import Obstacle, Tool, as_tool
 LARGEST_SHARE = 0.5
 #: A tool that has to catch up with its keyframes moves at this many times their highest speed.
 CATCHING_UP = 2.0
+#: What obstacles' rows and pairs have, by type.
+ROWS = {
+    wp.int32: ("acts",),
+    wp.float32: ("gap", "friction"),
+    wp.vec3: ("normal", "moved", "force", "more"),
+    wp.vec4: ("weights",),
+}
 
 
 def have_edges(obstacles: Sequence[Obstacle]) -> bool:
@@ -298,9 +307,9 @@ class RigidForces:
         law: The law of contact: how far gaps may close in a step.
 
     Attributes:
-        forces: The force of each obstacle on each surface node itself in the last step [N], vec3 [O, S].
-        totals: The same with the nodes' shares of the forces between them, when they were last published.
-        touches: Obstacles at triangles.
+        rows: Obstacles at places and at triangles, one after another, as a struct for kernels.
+        totals: The forces of each obstacle on each node with the nodes' shares of those between them, when they were
+            last published [N], vec3 [O, S].
         have_edges: Whether any of the obstacles can pass between the nodes.
     """
 
@@ -318,21 +327,33 @@ class RigidForces:
             return
         self._taken, device = self.surface.revision, self.device
         count, obstacles = self.surface.count, self.obstacles.count
-        self.forces = wp.zeros((obstacles, count), dtype=wp.vec3, device=device)
-        self.totals = wp.zeros_like(self.forces)
-        self.anchors = wp.zeros((obstacles, count), dtype=wp.vec4, device=device)
-        self._away, self._moved = wp.zeros_like(self.anchors), wp.zeros_like(self.forces)
-        self.allowances = wp.zeros((obstacles, count), dtype=wp.float32, device=device)
-        self.touches = touches.Touches()
-        shape = (obstacles, self.surface.triangle_count if self.have_edges else 0)
-        for name in ("shares", "normal", "moved", "force", "more"):
-            setattr(self.touches, name, wp.zeros(shape, dtype=wp.vec3, device=device))
-        for name in ("gap", "friction", "allowance"):
-            setattr(self.touches, name, wp.zeros(shape, dtype=wp.float32, device=device))
-        self.touches.warmth = self.surface.warmth
-        self.touches.acts = wp.zeros(shape, dtype=wp.int32, device=device)
-        self._more = wp.zeros_like(self.forces)
-        self._acts = wp.zeros((obstacles, count), dtype=wp.int32, device=device)
+        of_places, of_triangles = obstacles * count, obstacles * self.surface.triangle_count * self.have_edges
+        self.anchors = wp.zeros(of_places, dtype=wp.vec4, device=device)
+        self.allowance = wp.zeros(of_places + of_triangles, dtype=wp.float32, device=device)
+        self.rows = rows_of(of_places + of_triangles, device)
+        # Places keep these.
+        self.rows.weights[:of_places].fill_(wp.vec4(1.0, 0.0, 0.0, 0.0))
+        self.rows.friction[:of_places].assign(np.repeat(self.obstacles.shapes.friction.numpy(), count))
+        self.totals = wp.zeros((obstacles, count), dtype=wp.vec3, device=device)
+
+    @property
+    def arrays(self) -> Rigid:
+        """The obstacles, the surfaces and what is between them, as a struct for kernels."""
+        rigid = Rigid()
+        rigid.shapes, rigid.motions, rigid.law = self.obstacles.shapes, self.obstacles.motions, self._law
+        rigid.surface, rigid.first_triangle, rigid.warmth = self.surface.arrays, self.totals.size, self.surface.warmth
+        rigid.anchors, rigid.allowance, rigid.rows = self.anchors, self.allowance, self.rows
+        return rigid
+
+    @property
+    def forces(self) -> wp.array:
+        """The force of each obstacle on each surface node itself in the last step [N], vec3 [O, S]."""
+        return self.rows.force[: self.totals.size].reshape(self.totals.shape)
+
+    @property
+    def touch_count(self) -> int:
+        """Number of obstacles at triangles."""
+        return len(self.rows.force) - self.totals.size
 
     @property
     def is_separate(self) -> bool:
@@ -341,48 +362,52 @@ class RigidForces:
 
     def forget(self) -> None:
         """Forget the last step."""
-        self.anchors.zero_()
-        self.touches.force.zero_()
-        for allowances in (self.allowances, self.touches.allowance):
-            allowances.zero_()
-        self.forces.zero_()
+        for array in (self.anchors, self.allowance, self.rows.force):
+            array.zero_()
 
     def reset(self, chosen: wp.array) -> None:
         """Forget the last step in chosen worlds, nonzero in int32 [worlds]."""
-        count = max(self.surface.count, self.surface.triangle_count if self.have_edges else 0)
-        inputs = [chosen, self.surface.triangles]
-        wp.launch(
-            sums.forget_places,
-            (self.obstacles.count, count),
-            inputs,
-            [self.arrays, self.touches],
-            device=self.device,
-        )
+        inputs = [chosen, self.surface.triangles, self.arrays]
+        wp.launch(sums.forget_rows, len(self.rows.force), inputs, device=self.device)
 
     @property
     def state(self) -> dict[str, wp.array]:
         """The arrays that it keeps from step to step."""
-        touches = self.touches
-        sides = {"touch_normals": touches.normal.flatten(), "touch_forces": touches.force.flatten()}
-        sides |= {"allowances": self.allowances.flatten(), "touch_allowances": touches.allowance.flatten()}
-        return {"anchors": self.anchors.flatten(), "forces": self.forces.flatten(), **sides}
+        rows = self.rows
+        return {"anchors": self.anchors, "allowance": self.allowance, "force": rows.force, "normal": rows.normal}
 
-    # --- launches --------------------------------------------------------------------------------------------------
+    def parts(self, name: str) -> tuple[npt.NDArray[Any], npt.NDArray[Any]]:
+        """Copies of an array of ``state``: at places, [O, S, ...], and at triangles, [O, T, ...]; waits for the
+        device."""
+        return split_rows(np.array(self.state[name].numpy()), *self.totals.shape)
+
+    def assign(self, parts: dict[str, tuple[npt.NDArray[Any], npt.NDArray[Any]]]) -> None:
+        """Set arrays of ``state`` to what ``parts`` gave."""
+        for name, array in self.state.items():
+            if name in parts:
+                array.assign(np.concatenate([each.reshape(-1, *each.shape[2:]) for each in parts[name]]))
 
     def launch_totals(self) -> wp.array:
         """Launch the sums of all forces of each obstacle on each node, [O, S]."""
         if not self.have_edges:
             return self.forces
-        inputs = [self.surface.corner_starts, self.surface.corners, self.touches, self.forces]
-        wp.launch(sums.share_touches, self.forces.shape, inputs, [self.totals], device=self.device)
+        surface = self.surface
+        inputs = [surface.corner_starts, surface.corners, surface.triangle_count, self.arrays]
+        wp.launch(sums.share_touches, self.totals.shape, inputs, [self.totals], device=self.device)
         return self.totals
 
-    @property
-    def arrays(self) -> Rigid:
-        """The obstacles, the surfaces and what is between them, as they are now."""
-        rigid = Rigid()
-        rigid.shapes, rigid.motions, rigid.law = self.obstacles.shapes, self.obstacles.motions, self._law
-        rigid.surface, rigid.forces, rigid.anchors = self.surface.arrays, self.forces, self.anchors
-        rigid.away, rigid.moved, rigid.allowance = self._away, self._moved, self.allowances
-        rigid.more, rigid.acts = self._more, self._acts
-        return rigid
+
+def split_rows(rows: npt.NDArray[Any], obstacles: int, places: int) -> tuple[npt.NDArray[Any], npt.NDArray[Any]]:
+    """Views of values of obstacles' rows: at places, [O, S, ...], and at triangles, [O, T, ...]."""
+    at = obstacles * places
+    count = (len(rows) - at) // obstacles
+    return rows[:at].reshape(obstacles, places, *rows.shape[1:]), rows[at:].reshape(obstacles, count, *rows.shape[1:])
+
+
+def rows_of(count: int, device: wp.Device) -> Rows:
+    """A table of so many rows, without what only pairs have."""
+    rows = Rows()
+    for dtype, names in ROWS.items():
+        for name in names:
+            setattr(rows, name, wp.zeros(count, dtype=dtype, device=device))
+    return rows

@@ -7,14 +7,15 @@ import numpy.typing as npt
 import warp as wp
 
 from warp_corot.errors import UnstableError
-from warp_corot.kernels.contact import boxes, wide_tree
 from warp_corot.kernels.contact import search as kernels
+from warp_corot.kernels.contact import wide_tree
 from warp_corot.kernels.contact.crushed import mark_crushed
 from warp_corot.kernels.contact.rows import Meeting, OldRows, Rows, begin_rows, end_rows, keep_rows
 from warp_corot.kernels.contact.search import pair_finder
 from warp_corot.kernels.contact.watch import HIT
 from warp_corot.solvers.halo import ALONE, Halo
 
+from .obstacles import rows_of
 from .options import Contact
 from .search import Search
 from .surface import ContactSurface
@@ -113,17 +114,15 @@ class Pairs:
 
     def _rows_for(self, room: int) -> tuple[Rows, OldRows]:
         device, owners = self.device, self.surface.count + self.surface.edge_count
-        rows, old = Rows(), OldRows()
+        rows, old = rows_of(room, device), OldRows()
+        rows.friction.fill_(self.friction)
         rows.total = wp.zeros(1, dtype=wp.int32, device=device)
         for kept in (rows, old):
             kept.starts, kept.counts = (wp.zeros(owners, dtype=wp.int32, device=device) for _ in range(2))
-            kept.other, kept.acts = (wp.zeros(room, dtype=wp.int32, device=device) for _ in range(2))
-            kept.force = wp.zeros(room, dtype=wp.vec3, device=device)
+            kept.other = wp.zeros(room, dtype=wp.int32, device=device)
+        old.acts, old.force = wp.zeros_like(rows.acts), wp.zeros_like(rows.force)
         rows.owner = wp.zeros(room, dtype=wp.int32, device=device)
-        rows.normal, rows.more = (wp.zeros(room, dtype=wp.vec3, device=device) for _ in range(2))
         rows.places = wp.zeros(room, dtype=wp.vec4i, device=device)
-        rows.shares = wp.zeros(room, dtype=wp.vec4, device=device)
-        rows.gap = wp.zeros(room, dtype=wp.float32, device=device)
         rows.away = wp.zeros(room if device.is_cpu else 0, dtype=wp.float32, device=device)
         return rows, old
 
@@ -179,7 +178,7 @@ class Pairs:
         self._built = self.search.count
         for k, tree in enumerate(self._trees):
             roots = self.meeting.roots[k]
-            wp.launch(boxes.find_roots, roots.size, [tree.id], [roots.flatten()], device=self.device)
+            wp.launch(wide_tree.find_roots, roots.size, [tree.id], [roots.flatten()], device=self.device)
 
     def forget(self) -> None:
         """Forget the forces of the last step."""
@@ -189,7 +188,7 @@ class Pairs:
 
     def _box(self) -> None:
         inputs = [self.surface.arrays, self.meeting]
-        boxed = (boxes.box_triangles, boxes.box_edges)
+        boxed = (wide_tree.box_triangles, wide_tree.box_edges)
         for kernel, (lower, upper) in zip(boxed, self._boxes, strict=True):
             wp.launch(kernel, len(lower), inputs, [lower, upper], device=self.device)
 

@@ -103,7 +103,7 @@ def _of_pairs(pairs: Pairs, x: Floats, nodes: int) -> Iterator[ActingRow]:
     rows = pairs.rows
     count = min(int(rows.total.numpy()[0]), len(rows.owner))
     acts, owner, gap = (each.numpy()[:count] for each in (rows.acts, rows.owner, rows.gap))
-    force, normal, weights = (each.numpy()[:count].astype(float) for each in (rows.force, rows.normal, rows.shares))
+    force, normal, weights = (each.numpy()[:count].astype(float) for each in (rows.force, rows.normal, rows.weights))
     places = rows.places.numpy()
     for k in np.flatnonzero((acts != 0) & force.any(axis=1)):
         first = 1 if owner[k] < nodes else 2
@@ -121,12 +121,13 @@ def _at_places(contacts: Contacts, rigid: RigidForces, x: Floats) -> Iterator[Ac
 
 
 def _at_triangles(rigid: RigidForces, corners: npt.NDArray[np.integer], x: Floats) -> Iterator[ActingRow]:
-    touches = rigid.touches
-    acts, gap = touches.acts.numpy(), touches.gap.numpy()
-    force, weights, normal = (each.numpy().astype(float) for each in (touches.force, touches.shares, touches.normal))
-    for o, t in np.argwhere((acts != 0) & force.any(axis=2)):
-        w, places = weights[o, t], corners[t]
-        yield ActingRow(int(o), 3, places, w, w @ x[places], normal[o, t], float(gap[o, t]), force[o, t])
+    rows, first = rigid.rows, rigid.totals.size
+    acts, gap = rows.acts.numpy(), rows.gap.numpy()
+    force, weights, normal = (each.numpy().astype(float) for each in (rows.force, rows.weights, rows.normal))
+    for r in first + np.flatnonzero((acts != 0)[first:] & force[first:].any(axis=1)):
+        o, t = divmod(int(r) - first, len(corners))
+        w, places = weights[r, :3], corners[t]
+        yield ActingRow(o, 3, places, w, w @ x[places], normal[r], float(gap[r]), force[r])
 
 
 def _point(contacts: Contacts, row: ActingRow) -> ContactPoint:

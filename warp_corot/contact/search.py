@@ -10,10 +10,8 @@ import warp as wp
 
 from warp_corot.errors import UnstableError
 from warp_corot.kernels.contact import beside
-from warp_corot.kernels.contact import sleep as sleeping
 from warp_corot.kernels.contact import watch as kernels
-from warp_corot.kernels.contact.touches import Touches
-from warp_corot.kernels.contact.vertices import Rigid
+from warp_corot.kernels.contact.explicit_rows import Rigid
 from warp_corot.solvers.pace import Mapped
 
 from .surface import ContactSurface
@@ -216,15 +214,15 @@ class Search:
 
     def _launch(self, first: int, last: int, asks: int, sleeps: bool) -> None:
         """Launch phases of a search."""
-        rigid, touches, triangles, threads = Rigid(), Touches(), 0, 1
+        rigid, triangles, threads = Rigid(), 0, 1
         rigid.surface, rigid.motions = self.surface.arrays, self.obstacles.motions
         if self.rigid is not None:
-            rigid, touches, triangles = self.rigid.arrays, self.rigid.touches, self.rigid.touches.force.size
+            rigid, triangles = self.rigid.arrays, self.rigid.touch_count
         if self.device.is_cuda:
             blocks = -(-max(self.surface.count + triangles, self.watch.poses.size) // BLOCK)
             threads = BLOCK * min(max(blocks, 1), BLOCKS_EACH * self.device.sm_count)
         inputs = [threads, int(first), int(last), asks, int(sleeps), self.surface.triangles]
-        outputs = [rigid, self.watch, self.near, touches, self._arrived]
+        outputs = [rigid, self.watch, self.near, self._arrived]
         wp.launch(beside.search_near, threads, inputs, outputs, device=self.device, block_dim=min(threads, BLOCK))
 
     def _on_nodes(self, kernel: wp.Kernel, inputs: list) -> None:
@@ -269,7 +267,7 @@ class Sleep:
             inputs = [threads, start, count, nodes, int(self.is_framed), moved, obstacles.motions]
             inputs += [body.conditions.world_starts, self._system.pace.arrays, offset]
             inputs += [*self._places(k), body.state.velocities]
-            wp.launch(sleeping.rouse, threads, inputs, [self._watch], device=self._device)
+            wp.launch(kernels.rouse, threads, inputs, [self._watch], device=self._device)
         # A branch takes longer than launches that end at once.
         act()
 
@@ -278,7 +276,7 @@ class Sleep:
         for k in range(len(self._system.bodies)):
             start, count, nodes = self._surface.nodes_of(k)
             inputs = [start, nodes, int(self.is_framed), self._system.pace.arrays, *self._places(k)]
-            wp.launch(sleeping.check_sleep, count, inputs, [self._watch], device=self._device)
+            wp.launch(kernels.check_sleep, count, inputs, [self._watch], device=self._device)
 
     def _places(self, k: int) -> list[wp.array]:
         """Rest positions and displacements of a body."""

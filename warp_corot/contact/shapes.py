@@ -189,6 +189,12 @@ def turn_from_z(n: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
     return q / length if length > 1e-6 else np.array([1.0, 0.0, 0.0, 0.0])
 
 
+def axis_of(q: npt.NDArray[np.floating]) -> npt.NDArray[np.float64]:
+    """The z axis of a frame with this rotation (x, y, z, w), [3]."""
+    x, y, z, w = np.asarray(q, np.float64)
+    return np.array((2.0 * (x * z + w * y), 2.0 * (y * z - w * x), 1.0 - 2.0 * (x * x + y * y)))
+
+
 # --- of any shape -----------------------------------------------------------------------------------------------------
 
 Floats = npt.NDArray[np.float64]

@@ -13,12 +13,11 @@ import warp as wp
 from warp_corot.domain.units import length
 from warp_corot.errors import StabilityWarning, depth_of_user
 from warp_corot.kernels.contact import shapes as kinds
-from warp_corot.kernels.contact import sums
 from warp_corot.kernels.contact.crushed import count_crushed
 from warp_corot.solvers.halo import ALONE
 
 from .obstacles import measured_gaps
-from .shapes import Capsule, Cylinder, Ground, SignedDistance, TriangleMesh
+from .shapes import Capsule, Cylinder, Ground, SignedDistance, TriangleMesh, axis_of
 from .tool import FITTING
 
 if TYPE_CHECKING:
@@ -47,10 +46,14 @@ def warn_of_overlaps(contacts: Contacts, least: float) -> None:
     """
     speed = f"pushed out at no more than {contacts.law.recovery:.2g} m/s"
     if contacts.obstacles.count:
-        depths = wp.zeros(contacts.surface.count, dtype=wp.float32, device=contacts.device)
-        inputs = [contacts.obstacles.shapes, contacts.obstacles.motions, contacts.surface.arrays]
-        wp.launch(sums.find_depths, contacts.surface.count, inputs, [depths], device=contacts.device)
-        deep, ranks = depths.numpy(), ALONE if contacts.surface.is_whole else contacts.system.ranks
+        arrays, obstacles = contacts.surface.arrays, contacts.obstacles
+        moves = np.flatnonzero((arrays.node.numpy() >= 0) & (arrays.yielding.numpy() > 0.0))
+        worlds, points = (np.tile(each.numpy()[moves], (obstacles.count, 1)) for each in (arrays.world, arrays.x))
+        numbers = np.repeat(np.arange(obstacles.count), len(moves))
+        given = numbers, worlds.ravel(), points.reshape(-1, 1, 3), 1e-3
+        gaps, _ = measured_gaps(obstacles.shapes, obstacles.motions.later, *given)
+        deep, ranks = -gaps.reshape(obstacles.count, -1).min(axis=0), contacts.system.ranks
+        ranks = ALONE if contacts.surface.is_whole else ranks
         count, deepest = int(ranks.sum(int((deep > least).sum()))), ranks.max(float(deep.max(initial=0.0)))
         if count:
             _warn(f"{count} surface nodes begin inside obstacles, by up to {length(deepest)}; they are {speed}")
@@ -150,8 +153,7 @@ def _axis(tool: Tool, pose: Floats) -> Floats:
     if isinstance(shape, Ground | TriangleMesh | SignedDistance):
         return np.zeros((0, 3))
     half = shape.size[1] if isinstance(shape, Capsule | Cylinder) else 0.0
-    axis = np.asarray(wp.quat_rotate(wp.quat(*pose[3:]), wp.vec3(0.0, 0.0, 1.0)), float)
-    return pose[:3] + np.linspace(-half, half, ALONG if half else 1)[:, None] * axis
+    return pose[:3] + np.linspace(-half, half, ALONG if half else 1)[:, None] * axis_of(pose[3:])
 
 
 def _depths(surface: Floats, triangles: npt.NDArray[np.int32], points: Floats, device: wp.Device) -> Floats:

@@ -55,7 +55,7 @@ KEYFRAMES = (("trajectories", "nodes", "displacements"), ("activations", "elemen
 #: Arrays of a body with an entry for each node of all worlds, by the ends of their names.
 NODAL = ("displacements", "velocities", "reactions", "constrained", "loads")
 #: Arrays of obstacles and surface places, and of triangles, that one step leaves for the next.
-OF_PLACES, OF_TRIANGLES = ("anchors", "forces"), ("normal", "force")
+OF_PLACES, OF_TRIANGLES = ("anchors", "force"), ("normal", "force")
 #: Arrays of obstacles and numbers of the law, which are the same on all ranks.
 MOTIONS, LAW = ("now", "later", "target"), ("tolerance", "recovery", "whole", "grain")
 
@@ -286,13 +286,13 @@ def _pack(here: Contacts) -> Touch:
     node, chosen = _places_of(here, own)
     nodal: Arrays = {"body": body.state.contact_forces.numpy()[: len(own)][own]}
     for name in OF_PLACES:
-        values = np.moveaxis(getattr(here.rigid, name).numpy(), 0, 1)
+        values = np.moveaxis(here.rigid.parts(name)[0], 0, 1)
         of_nodes = np.zeros((len(own), *values.shape[1:]), values.dtype)
         of_nodes[node[chosen]] = values[chosen]
         nodal[name] = of_nodes[own]
     triangles: Arrays = {"triangles": faces}
     for name in OF_TRIANGLES:
-        values = getattr(here.rigid.touches, name).numpy()[:, : body.worlds * len(faces)]
+        values = here.rigid.parts(name)[1][:, : body.worlds * len(faces)]
         shape = (len(values), body.worlds, len(faces), 3)
         triangles[name] = np.moveaxis(values.reshape(shape), 2, 0) if values.size else np.zeros(0)
     return Touch(nodal, triangles, _common_of(here))
@@ -310,11 +310,9 @@ def _take(here: Contacts, nodal: Arrays, pieces: Sequence[Arrays]) -> None:
     worlds, (own, faces) = here.system.bodies[0].worlds, _surface_of(here.system.bodies[0])
     node, chosen = _places_of(here, own)
     used = chosen if here.system.is_implicit else node >= 0
+    given_rows = {name: here.rigid.parts(name) for name in {*OF_PLACES, *OF_TRIANGLES}}
     for name in OF_PLACES:
-        array = getattr(here.rigid, name)
-        values = array.numpy()
-        values[:, used] = np.moveaxis(nodal[name][node[used]], 1, 0)
-        array.assign(values)
+        given_rows[name][0][:, used] = np.moveaxis(nodal[name][node[used]], 1, 0)
     count = len(faces)
     given = np.concatenate([faces, *(piece["triangles"] for piece in pieces)])
     _, number = np.unique(given, axis=0, return_inverse=True)
@@ -322,12 +320,11 @@ def _take(here: Contacts, nodal: Arrays, pieces: Sequence[Arrays]) -> None:
     place = np.full(number.max(initial=-1) + 1, -1)
     place[number[count:]] = np.arange(len(given) - count)
     for name in OF_TRIANGLES:
-        array = getattr(here.rigid.touches, name)
-        values = array.numpy()
+        values = given_rows[name][1]
         if values.size:
             theirs = np.concatenate([piece[name] for piece in pieces])[place[number[:count]]]
             values[:, : worlds * count] = np.moveaxis(theirs, 0, 2).reshape(len(values), -1, 3)
-            array.assign(values)
+    here.rigid.assign(given_rows)
     here.search.forget()
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.sparse import coo_array, csr_array
 
-from warp_corot.contact.shapes import Ground, Shape, Sphere
+from warp_corot.contact.shapes import Ground, Shape, Sphere, axis_of
 from warp_corot.errors import InputError
 
 from .contact import Column, RestingContact
@@ -90,14 +90,8 @@ class PreciseContact:
         shape = self._shapes[column.row.obstacle]
         away = x - shape.position
         if isinstance(shape, Ground):
-            up = _axis(shape)
+            up = axis_of(shape.quaternion)
             return float(up @ away), up, np.zeros((3, 3))
         distance = float(np.linalg.norm(away))
         normal = away / distance
         return distance - shape.size[0], normal, (np.eye(3) - np.outer(normal, normal)) / distance
-
-
-def _axis(shape: Shape) -> Array:
-    """The z axis of a shape's frame, [3]."""
-    x, y, z, w = np.asarray(shape.quaternion, np.float64)
-    return np.array((2.0 * (x * z + w * y), 2.0 * (y * z - w * x), 1.0 - 2.0 * (x * x + y * y)))
