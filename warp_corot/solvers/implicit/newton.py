@@ -135,9 +135,8 @@ class Newton:
         self.linearise()
         self.system.update()
         self.system.solve()
-        inputs = [self.body.conditions.mass, self.residual, self._outer, self.step, u, *sums.sizes]
-        wp.launch(kernels.measure_step, sums.shape, inputs, [sums.parts], device=self.device)
-        sums.take_in(int(kernels.SLOPE), int(kernels.OUTER), int(kernels.INERTIA))
+        inputs = [self.body.conditions.mass, self.residual, self._outer, self.step, u]
+        sums.launch(kernels.measure_step, inputs, int(kernels.SLOPE), int(kernels.OUTER), int(kernels.INERTIA))
         sums.take_in(int(kernels.STEP), int(kernels.REACH), most=True)
         self._searching.zero_()
         self._accepted.zero_()
@@ -160,11 +159,10 @@ class Newton:
         if self._others is not None:
             self._others()
         inputs: list[Any] = [self.gravity, conditions.mass, conditions.inverse_mass, int(conditions.has_loads)]
-        inputs += [conditions.loads, self.external_share, self.inertia, self.pull, self.increment, *sums.sizes]
-        outputs = [self.forces, body.state.forces, self.residual, self._outer, sums.parts]
+        inputs += [conditions.loads, self.external_share, self.inertia, self.pull, self.increment]
+        inputs += [self.forces, body.state.forces, self.residual, self._outer]
         kernel = FIND_RESIDUAL[conditions.loads.dtype]
-        wp.launch(kernel, sums.shape, inputs, outputs, device=self.device)
-        sums.take_in(int(kernels.SQUARE), int(kernels.REFERENCE))
+        sums.launch(kernel, inputs, int(kernels.SQUARE), int(kernels.REFERENCE))
 
     def linearise(self) -> None:
         """Launch the linearisation at the present displacements, or at ``turned``; the residual must be known."""
@@ -181,10 +179,8 @@ class Newton:
         self._energies.zero_()
         self.field.write_potentials(self.body.state.displacements, self._energies)
         self.ranks.owned(self.body).clear_copies(self._energies)
-        sums = self._sums
-        inputs = [self._energies, len(self._energies) // self.worlds, *sums.sizes[1:]]
-        wp.launch(kernels.sum_energies, sums.shape, inputs, [sums.parts], device=self.device)
-        sums.take_in(int(kernels.ENERGY))
+        inputs = [self._energies, len(self._energies) // self.worlds]
+        self._sums.launch(kernels.sum_energies, inputs, int(kernels.ENERGY))
 
     def _try_step(self, *, commits: bool) -> None:
         inputs = [self._scalars, self.base, self.step, self._count, int(commits)]
