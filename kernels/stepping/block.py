@@ -54,9 +54,8 @@ from .block_memory import (
     RESERVE,
     STORE,
     WRITE,
+    shared_array,
     shared_list,
-    shared_numbers,
-    shared_vectors,
 )
 from .integrate import Dynamics, add_support_work, is_finite, load_at, symplectic_euler_velocity
 from .pace import DONE, DT, Pace, length_before
@@ -142,7 +141,7 @@ def _left_out_of(layout: Layout, displacement: wp.Function, slot: wp.Function) -
     handed = _table([[int(h)] for h in HANDEDNESS[shape]])
     rest_of = _vectors([[2.0 * c for c in point] for point in POSITIONS[shape]])
     columns, leaf_forces = columns_of(shape), leaf_forces_of(shape)
-    waiting, force = shared_list(room), shared_vectors(4 * room, "forces of single leaves")
+    waiting, force = shared_list(room), shared_array(4 * room, "forces of single leaves")
 
     @wp.func
     def enlist(thread: int, degenerate: int):
@@ -228,15 +227,15 @@ def step_block(layout: Layout) -> wp.Kernel:
     capacity, threads, zero_slot = layout.subtrees, layout.threads, layout.slot_count
     own = [own_forces(shape, uniform, chosen=layout.leaves(part)) for part in range(parts)]
     needs, places = [layout.needs(part) for part in range(parts)], layout.places
-    displacement, velocity = shared_vectors(layout.nodes, "displacements"), shared_vectors(layout.nodes, "velocities")
+    displacement, velocity = shared_array(layout.nodes, "displacements"), shared_array(layout.nodes, "velocities")
     displacements = [_displacements_of(layout, part, displacement) for part in range(parts)]
-    slot = shared_vectors(zero_slot + 1, "forces")
+    slot = shared_array(zero_slot + 1, "forces")
     slope_of = VOLUME_CHANGE.slope
     measure = [dilatation_sums_of(shape, uniform, VOLUME_CHANGE, layout.leaves(part)) for part in range(parts)]
     # Law and pressure are one pass, after a first pass for the sums if two threads share a subtree.
     law = dilating_leaves(shape)
     dilate = [subtree_forces(shape, uniform, law, layout.leaves(part)) for part in range(parts)]
-    sums = shared_numbers(max(layout.sum_count, 1), "sums of dilatations")
+    sums = shared_array(max(layout.sum_count, 1), "sums of dilatations", float)
     waiting, enlist, do_one, collect = _left_out_of(layout, displacement, slot)
 
     @law_kernel(
