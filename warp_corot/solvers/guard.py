@@ -433,26 +433,26 @@ class EnergyControl:
         """
         if self._safe_step is None:
             return
-        guard, share = self._guard, self._safe_step.share
+        guard, share = self._guard, self._safe_step.control.share
         intervals = (steps - self._pace.schedule.steps) / self._recorded.interval
         self._pace.schedule = self._pace.schedule._replace(steps=steps)
         more = guard.gain / (LITTLE_GAIN * max(1.0 - guard.surplus / MOST_SURPLUS, LEAST_LEAVE))
         share = share * max(1.0 / math.sqrt(more), 0.5) if more > 1.0 else min(share * RECOVERY**intervals, 1.0)
-        if share != self._safe_step.share:
+        if share != self._safe_step.control.share:
             self._take_share(share)
 
     def halve(self, steps: int) -> None:
         """Take half the share, after going back to the state with this number of steps."""
         assert self._safe_step is not None
         self._pace.schedule = self._pace.schedule._replace(steps=steps)
-        self._take_share(0.5 * self._safe_step.share)
+        self._take_share(0.5 * self._safe_step.control.share)
 
     def choose_intervals(self, *, checked: bool) -> None:
         """Check more often if a body is strained, and less often if checks of elastic energies found it calm."""
         if self._safe_step is None:
             return
         guard = self._guard
-        share, allowed, at_rest = self._safe_step.shares
+        allowed, share, at_rest, *_ = self._safe_step.control
         before = self._pace.schedule
         calm = 0
         if not checked or allowed < FALLING * before.allowed:
@@ -476,6 +476,5 @@ class EnergyControl:
     def _take_share(self, share: float) -> None:
         """Set the share of the allowed step from here on."""
         assert self._safe_step is not None
-        self._safe_step.share = max(share, float(LEAST))
-        self._safe_step.resume()
+        self._safe_step.take_share(max(share, float(LEAST)))
         self._guard.settle()

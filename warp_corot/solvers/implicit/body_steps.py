@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import warp as wp
@@ -30,21 +29,6 @@ if TYPE_CHECKING:
 
 #: The search for soft surfaces leaves room for this many times what a body that is let go falls in a step.
 FALLS = 0.25
-
-
-@dataclass(frozen=True)
-class StepCounts:
-    """How the solve for a step ended, in each world or in all of them together.
-
-    Attributes:
-        iterations, linear_iterations, status: int32 [worlds] or [1].
-        good: The status of a step that is within the tolerance.
-    """
-
-    iterations: wp.array
-    linear_iterations: wp.array
-    status: wp.array
-    good: int
 
 
 class SharedSteps:
@@ -214,21 +198,21 @@ class BodySteps:
         inputs = [self.body.conditions.inverse_mass, state.displacements, state.velocities, *self._left]
         self._launch(kernels.find_changes, inputs, [self.begins])
 
-    def launch_end(self, offset: int, counts: StepCounts, *, is_last: bool) -> None:
+    def launch_end(self, offset: int, counts: list[Any], *, is_last: bool) -> None:
         """Launch the state after the step, and the count of its iterations.
 
         Args:
             offset: As for ``launch_changes``.
-            counts: How the step's solve ended.
+            counts: How the step's solve ended in each world or in all of them together: iterations, linear iterations
+                and status, int32 [worlds] or [1], and the status of a step that is within the tolerance.
             is_last: Whether this may be the last step of a run, whose reactions a user may read.
         """
-        self._end(offset, counts.status)
+        self._end(offset, counts[2])
         if is_last or not self._can_leave_out_reactions:
             self._find_reactions()
         else:
             wp.capture_if(self._moves, self._find_reactions)
-        inputs = [counts.iterations, counts.linear_iterations, counts.status, counts.good]
-        wp.launch(kernels.count_solves, 1, inputs, [self.shared.totals], device=self.device)
+        wp.launch(kernels.count_solves, 1, counts, [self.shared.totals], device=self.device)
 
     # --- pieces ------------------------------------------------------------------------------------------------------
 
