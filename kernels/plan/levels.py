@@ -95,7 +95,7 @@ def find_starts(
 ):
     """The start of each level among ``count`` nodes sorted by level."""
     wanted = wp.tid()
-    starts[wanted] = wp.lower_bound(level, 0, count, wanted)
+    starts[wanted] = wp.lower_bound(level, 0, count + 1, wanted)
 
 
 @wp.kernel(enable_backward=False)

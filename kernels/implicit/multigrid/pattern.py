@@ -51,7 +51,7 @@ def pair_of(key: wp.int64, bits: int):
 @wp.func
 def place_of(i: int, j: int, starts: wp.array[wp.int32], columns: wp.array[wp.int32]):
     """The place of an entry in its row, or -1."""
-    p = wp.lower_bound(columns, starts[i], starts[i + 1], j)
+    p = wp.lower_bound(columns, starts[i], starts[i + 1] + 1, j)
     # Past the end nothing may be read.
     if p == starts[i + 1] or columns[wp.min(p, starts[i + 1] - 1)] != j:
         p = int(-1)
@@ -247,7 +247,8 @@ def find_row_starts(
 ):
     """Find the position among ``count`` sorted keys at which each row begins, and at which the last one ends."""
     row = wp.tid()
-    starts[row] = wp.lower_bound(keys, 0, count, key_of(row, 0, bits))
+    # Warp's function gives no place past the last one that it is given, and does not read that one.
+    starts[row] = wp.lower_bound(keys, 0, count + 1, key_of(row, 0, bits))
 
 
 @wp.kernel(enable_backward=False)
