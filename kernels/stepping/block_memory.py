@@ -1,34 +1,8 @@
-"""Arrays and lists in a thread block's shared memory, each as one function that reads or writes it. CUDA only."""
+"""Arrays in a thread block's shared memory, each as one function that reads or writes it. CUDA only."""
 
 import warp as wp
 
 LOAD, STORE, LOAD_BYTES = 0, 1, 2
-RESERVE, WRITE, READ, COUNT, CLEAR = 0, 1, 2, 3, 4
-
-
-def shared_list(room: int) -> wp.Function:
-    """A list of integers in shared memory, as one function.
-
-    ``access`` says what it does: make room for ``value`` entries and return the first place, write or read entry ``i``,
-    return the number of entries, or clear the list.
-    """
-    snippet = f"""
-#if defined(__CUDA_ARCH__)
-    __shared__ int count;
-    __shared__ int entries[{room}];
-    if (access == {RESERVE}) return atomicAdd(&count, value);
-    if (access == {WRITE}) entries[i] = value;
-    if (access == {READ}) return entries[i];
-    if (access == {COUNT}) return count < {room} ? count : {room};
-    if (access == {CLEAR}) count = 0;
-#endif
-    return 0;
-"""
-
-    @wp.func_native(snippet)
-    def list_of(access: int, i: int, value: int) -> int: ...
-
-    return list_of
 
 
 def _array(memory: str, dtype: type) -> wp.Function:
