@@ -15,9 +15,9 @@ from warp_corot.kernels.implicit import steps as kernels
 from warp_corot.solvers.halo import ALONE
 
 from .block_system import BlockSystem
-from .contact_constraints import Contact, Hold, Touching
 from .multigrid import Multigrid
 from .newton import Newton
+from .operator import Contact, Hold, Touching
 from .preconditioners import Lagged, preconditioner_of
 from .tangent import TangentOperator, TurnedState
 
@@ -290,10 +290,8 @@ class BodySteps:
         state, conditions = body.state, body.conditions
         self.field.add_forces(state.displacements, newton.forces)
         self.shared.add_other_forces()
-        inputs = [system.gravity, conditions.mass, conditions.inverse_mass, int(conditions.has_loads)]
-        inputs += [conditions.loads, newton.forces, state.forces, newton.increment]
-        kernel = kernels.COUNT_SUPPORTS[conditions.loads.dtype]
-        self._launch(kernel, inputs, [state.reactions, system.support_work_of(body)])
+        inputs = [system.dynamics(body, 0.0), conditions.mass, newton.forces, newton.increment]
+        self._launch(kernels.count_supports, inputs, [state.reactions, system.support_work_of(body)])
         newton.forces.zero_()
         self.shared.forget_forces()
 

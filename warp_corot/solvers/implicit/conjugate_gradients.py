@@ -18,7 +18,7 @@ from warp_corot.solvers.halo import ALONE, Halo
 from .operator import Preconditioner, Product
 
 if TYPE_CHECKING:
-    from .contact_constraints import SolvedContact
+    from .operator import SolvedContact
 
 #: Number of lanes in a warp, minimum number of nodes of a thread, and maximum number of warps of all worlds.
 WARP, NODES, WARPS = 32, 4, 512

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -11,7 +11,8 @@ import warp as wp
 
 from warp_corot.kernels.implicit import newton as kernels
 from warp_corot.kernels.implicit.increments import move_held
-from warp_corot.kernels.implicit.residual import FIND_RESIDUAL
+from warp_corot.kernels.implicit.residual import find_residual
+from warp_corot.solvers.system import dynamics_of
 
 from .block_system import BlockSystem
 from .conjugate_gradients import WorldSums
@@ -158,11 +159,9 @@ class Newton:
         self.ranks.owned(self.body).clear_ghosts(self.forces)
         if self._others is not None:
             self._others()
-        inputs: list[Any] = [self.gravity, conditions.mass, conditions.inverse_mass, int(conditions.has_loads)]
-        inputs += [conditions.loads, self.external_share, self.inertia, self.pull, self.increment]
-        inputs += [self.forces, body.state.forces, self.residual, self._outer]
-        kernel = FIND_RESIDUAL[conditions.loads.dtype]
-        sums.launch(kernel, inputs, int(kernels.SQUARE), int(kernels.REFERENCE))
+        inputs = [dynamics_of(body, self.gravity, 0.0), conditions.mass, self.external_share, self.inertia, self.pull]
+        inputs += [self.increment, self.forces, self.residual, self._outer]
+        sums.launch(find_residual, inputs, int(kernels.SQUARE), int(kernels.REFERENCE))
 
     def linearise(self) -> None:
         """Launch the linearisation at the present displacements, or at ``turned``; the residual must be known."""
