@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from warp_corot.kernels.stepping.balance import sum_of_lanes
+from warp_corot.kernels.stepping.sums import sum_of_lanes
 
 from .explicit_rows import Rigid
 from .mass_split import force_of, grains_of

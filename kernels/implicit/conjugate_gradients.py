@@ -1,58 +1,25 @@
-"""Preconditioned conjugate gradients, and sums over the nodes of each world; all worlds iterate together.
+"""Preconditioned conjugate gradients; all worlds iterate together.
 
-Vectors are vec4, scalars float64. Sums are added up in a fixed order: first parts, which the next kernel adds up.
-
-A launch has ``threads`` threads for each world; ``lanes`` of them, a warp on CUDA and one on a CPU, compute a part.
+Vectors are vec4, scalars float64. Kernels with ``sums`` first add the parts of sums up; see ``stepping.sums``.
 """
 
 import warp as wp
 
 from warp_corot.kernels.elements.elements import load_node, store_node
-from warp_corot.kernels.stepping.balance import sum_of_lanes
+from warp_corot.kernels.stepping.sums import Sums, add_up, dot64, store_sum
 
 wp.set_module_options({"enable_backward": False})
 
 
-@wp.func
-def dot64(a: wp.vec3, b: wp.vec3):
-    """a . b in float64, because the products may exceed the range of float32."""
-    return wp.dot(wp.vec3d(a), wp.vec3d(b))
-
-
-@wp.func
-def add_up(parts: wp.array3d[wp.float64], world: int, lane: int, lanes: int, column: int):
-    """The sum of a world's parts, in the first lane."""
-    total = wp.float64(0.0)
-    k = lane
-    while k < parts.shape[1]:
-        total += parts[world, k, column]
-        k += lanes
-    return sum_of_lanes(total)
-
-
 @wp.kernel(enable_backward=False)
-def sum_products(
-    # In
-    a: wp.array[wp.vec4],
-    b: wp.array[wp.vec4],
-    count: int,
-    threads: int,
-    lanes: int,
-    column: int,
-    # Out
-    parts: wp.array3d[wp.float64],
-):
-    """Parts of a . b for each world of ``count`` nodes."""
+def sum_products(sums: Sums, a: wp.array[wp.vec4], b: wp.array[wp.vec4], column: int):
+    """Parts of a . b."""
     world, thread = wp.tid()
     total = wp.float64(0.0)
-    k = thread
-    while k < count:
-        i = world * count + k
+    for k in range(thread, sums.count, sums.threads):
+        i = world * sums.count + k
         total += dot64(load_node(a, i), load_node(b, i))
-        k += threads
-    total = sum_of_lanes(total)
-    if thread % lanes == 0:
-        parts[world, thread / lanes, column] = total
+    store_sum(sums, world, thread, column, total)
 
 
 #: Columns of parts of sums: r . r, r . z, p . q and b . b.
@@ -79,41 +46,26 @@ def stop(status: wp.array[wp.int32], running: wp.array[wp.int32], world: int, ho
 
 
 @wp.kernel(enable_backward=False)
-def measure_guess(
-    # In
-    b: wp.array[wp.vec4],
-    x: wp.array[wp.vec4],
-    q: wp.array[wp.vec4],
-    count: int,
-    threads: int,
-    lanes: int,
-    # Out
-    parts: wp.array3d[wp.float64],
-):
+def measure_guess(sums: Sums, b: wp.array[wp.vec4], x: wp.array[wp.vec4], q: wp.array[wp.vec4]):
     """Find the parts of b . x and x . q, q = A x, for a first guess."""
     world, thread = wp.tid()
     product = wp.float64(0.0)
     curvature = wp.float64(0.0)
-    k = thread
-    while k < count:
-        i = world * count + k
+    for k in range(thread, sums.count, sums.threads):
+        i = world * sums.count + k
         guess = load_node(x, i)
         product += dot64(load_node(b, i), guess)
         curvature += dot64(load_node(q, i), guess)
-        k += threads
-    product = sum_of_lanes(product)
-    curvature = sum_of_lanes(curvature)
-    if thread % lanes == 0:
-        parts[world, thread / lanes, PRODUCT] = product
-        parts[world, thread / lanes, CURVATURE] = curvature
+    store_sum(sums, world, thread, PRODUCT, product)
+    store_sum(sums, world, thread, CURVATURE, curvature)
 
 
 @wp.kernel(enable_backward=False)
-def take_guess(parts: wp.array3d[wp.float64], lanes: int, scalars: wp.array2d[wp.float64]):
+def take_guess(sums: Sums, scalars: wp.array2d[wp.float64]):
     """alpha = b . x / x . q, the factor of the guess with the least energy; zero if the guess does not help."""
     world, lane = wp.tid()
-    product = add_up(parts, world, lane, lanes, PRODUCT)
-    curvature = add_up(parts, world, lane, lanes, CURVATURE)
+    product = add_up(sums, world, lane, PRODUCT)
+    curvature = add_up(sums, world, lane, CURVATURE)
     if lane == 0:
         alpha = wp.float64(0.0)
         if curvature > wp.float64(0.0) and is_number(curvature) and is_number(product):
@@ -124,19 +76,16 @@ def take_guess(parts: wp.array3d[wp.float64], lanes: int, scalars: wp.array2d[wp
 @wp.kernel(enable_backward=False)
 def begin(
     # In
+    sums: Sums,
     b: wp.array[wp.vec4],
     like: wp.array[wp.vec4],
     q: wp.array[wp.vec4],
     scalars: wp.array2d[wp.float64],
     guessed: int,
-    count: int,
-    threads: int,
-    lanes: int,
     # In and out
     x: wp.array[wp.vec4],
     # Out
     r: wp.array[wp.vec4],
-    parts: wp.array3d[wp.float64],
 ):
     """x = alpha x and r = b - alpha q with a guess, else x = 0 and r = b; parts of r . r, and of like . like for
     comparison."""
@@ -146,9 +95,8 @@ def begin(
         alpha = float(scalars[world, ALPHA])
     square = wp.float64(0.0)
     right = wp.float64(0.0)
-    k = thread
-    while k < count:
-        i = world * count + k
+    for k in range(thread, sums.count, sums.threads):
+        i = world * sums.count + k
         given = load_node(b, i)
         rest = given
         first = wp.vec3()
@@ -160,19 +108,14 @@ def begin(
         square += dot64(rest, rest)
         compared = load_node(like, i)
         right += dot64(compared, compared)
-        k += threads
-    square = sum_of_lanes(square)
-    right = sum_of_lanes(right)
-    if thread % lanes == 0:
-        parts[world, thread / lanes, SQUARE] = square
-        parts[world, thread / lanes, RIGHT] = right
+    store_sum(sums, world, thread, SQUARE, square)
+    store_sum(sums, world, thread, RIGHT, right)
 
 
 @wp.kernel(enable_backward=False)
 def take_first(
     # In
-    parts: wp.array3d[wp.float64],
-    lanes: int,
+    sums: Sums,
     tolerance: wp.array[wp.float64],
     share: wp.float64,
     # Out
@@ -183,8 +126,8 @@ def take_first(
 ):
     """Set the scalars before the first iteration; worlds whose residual is already small enough are done."""
     world, lane = wp.tid()
-    rr = add_up(parts, world, lane, lanes, SQUARE)
-    bb = add_up(parts, world, lane, lanes, RIGHT)
+    rr = add_up(sums, world, lane, SQUARE)
+    bb = add_up(sums, world, lane, RIGHT)
     if lane == 0:
         within = tolerance[world] * tolerance[world] * bb
         end = wp.max(within, share * share * rr)
@@ -209,8 +152,7 @@ def take_first(
 @wp.kernel(enable_backward=False)
 def take_beta(
     # In
-    parts: wp.array3d[wp.float64],
-    lanes: int,
+    sums: Sums,
     # In and out
     scalars: wp.array2d[wp.float64],
     status: wp.array[wp.int32],
@@ -218,7 +160,7 @@ def take_beta(
 ):
     """beta = r . z over its former value; zero in the first iteration."""
     world, lane = wp.tid()
-    rz = add_up(parts, world, lane, lanes, PRODUCT)
+    rz = add_up(sums, world, lane, PRODUCT)
     if lane == 0 and status[world] == RUNNING:
         before = scalars[world, RZ]
         scalars[world, BETA] = wp.where(before > wp.float64(0.0), rz / before, wp.float64(0.0))
@@ -232,8 +174,7 @@ def take_beta(
 @wp.kernel(enable_backward=False)
 def take_alpha(
     # In
-    parts: wp.array3d[wp.float64],
-    lanes: int,
+    sums: Sums,
     # In and out
     scalars: wp.array2d[wp.float64],
     iterations: wp.array[wp.int32],
@@ -242,7 +183,7 @@ def take_alpha(
 ):
     """alpha = r . z / p . q. If p . q <= 0 the world stops, at its last iterate, or with p = z if there is none."""
     world, lane = wp.tid()
-    curvature = add_up(parts, world, lane, lanes, CURVATURE)
+    curvature = add_up(sums, world, lane, CURVATURE)
     if lane == 0:
         alpha = wp.float64(0.0)
         if status[world] == RUNNING:
@@ -261,42 +202,33 @@ def take_alpha(
 @wp.kernel(enable_backward=False)
 def advance(
     # In
+    sums: Sums,
     p: wp.array[wp.vec4],
     q: wp.array[wp.vec4],
     scalars: wp.array2d[wp.float64],
-    count: int,
-    threads: int,
-    lanes: int,
     # In and out
     x: wp.array[wp.vec4],
     r: wp.array[wp.vec4],
-    # Out
-    parts: wp.array3d[wp.float64],
 ):
     """x += alpha p, r -= alpha q, and parts of r . r."""
     world, thread = wp.tid()
     alpha = float(scalars[world, ALPHA])
     total = wp.float64(0.0)
-    k = thread
-    while k < count:
-        i = world * count + k
+    for k in range(thread, sums.count, sums.threads):
+        i = world * sums.count + k
         rest = load_node(r, i)
         if alpha != 0.0:
             rest -= alpha * load_node(q, i)
             store_node(x, i, load_node(x, i) + alpha * load_node(p, i))
             store_node(r, i, rest)
         total += dot64(rest, rest)
-        k += threads
-    total = sum_of_lanes(total)
-    if thread % lanes == 0:
-        parts[world, thread / lanes, SQUARE] = total
+    store_sum(sums, world, thread, SQUARE, total)
 
 
 @wp.kernel(enable_backward=False)
 def judge(
     # In
-    parts: wp.array3d[wp.float64],
-    lanes: int,
+    sums: Sums,
     most: int,
     iterations: wp.array[wp.int32],
     # In and out
@@ -306,7 +238,7 @@ def judge(
 ):
     """Stop the worlds whose r . r is small enough."""
     world, lane = wp.tid()
-    rr = add_up(parts, world, lane, lanes, SQUARE)
+    rr = add_up(sums, world, lane, SQUARE)
     if lane == 0 and status[world] == RUNNING:
         scalars[world, RR] = rr
         if not is_number(rr):

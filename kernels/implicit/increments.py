@@ -7,9 +7,9 @@ first as the body turns as a whole. Then strains are the same, and forces have t
 import warp as wp
 
 from warp_corot.kernels.elements.elements import load_node, store_node
-from warp_corot.kernels.stepping.balance import sum_of_lanes
+from warp_corot.kernels.stepping.sums import Sums, add_up, store_sum
 
-from .conjugate_gradients import BROKEN, CONVERGED, LIMIT, add_up
+from .conjugate_gradients import BROKEN, CONVERGED, LIMIT
 
 wp.set_module_options({"enable_backward": False})
 
@@ -128,7 +128,7 @@ def judge_increments(
 #: The sums: mass, the number of held nodes, and from here on moments of mass, momenta and squares.
 MASS, HELD, FIRST, MOMENTUM, SPIN, SQUARES = (wp.constant(k) for k in (0, 1, 2, 5, 8, 11))
 MOTION_COLUMNS = 17
-Sums = wp.types.vector(length=MOTION_COLUMNS, dtype=wp.float64)
+Motion = wp.types.vector(length=MOTION_COLUMNS, dtype=wp.float64)
 #: A smaller turn is left out: its square is within the rounding of strains [rad].
 LEAST = wp.constant(wp.float64(1.0e-3))
 
@@ -136,7 +136,7 @@ LEAST = wp.constant(wp.float64(1.0e-3))
 @wp.func
 def motion_of(m: wp.float64, is_held: bool, x: wp.vec3d, v: wp.vec3d):
     """A node's share of the sums."""
-    one = Sums()
+    one = Motion()
     spin = wp.cross(x, v)
     one[MASS] = m
     if is_held:
@@ -153,32 +153,23 @@ def motion_of(m: wp.float64, is_held: bool, x: wp.vec3d, v: wp.vec3d):
 
 @wp.kernel(enable_backward=False)
 def sum_motion(
-    # In
+    sums: Sums,
     mass: wp.array[wp.float32],
     inverse_mass: wp.array[wp.float32],
     rest: wp.array[wp.vec4],
     u: wp.array[wp.vec4],
     v: wp.array[wp.vec4],
-    count: int,
-    threads: int,
-    lanes: int,
-    # Out
-    parts: wp.array3d[wp.float64],
 ):
     """Find parts of the sums of each world."""
     world, thread = wp.tid()
-    total = Sums()
-    k = thread
-    while k < count:
-        i = world * count + k
+    total = Motion()
+    for k in range(thread, sums.count, sums.threads):
+        i = world * sums.count + k
         if mass[i] > 0.0:
             x = wp.vec3d(load_node(rest, i)) + wp.vec3d(load_node(u, i))
             total += motion_of(wp.float64(mass[i]), inverse_mass[i] == 0.0, x, wp.vec3d(load_node(v, i)))
-        k += threads
     for column in range(MOTION_COLUMNS):
-        part = sum_of_lanes(total[column])
-        if thread % lanes == 0:
-            parts[world, thread / lanes, column] = part
+        store_sum(sums, world, thread, column, total[column])
 
 
 @wp.func
@@ -190,8 +181,7 @@ def skew(w: wp.vec3d):
 @wp.kernel(enable_backward=False)
 def find_turns(
     # In
-    parts: wp.array3d[wp.float64],
-    lanes: int,
+    sums: Sums,
     dt: wp.float64,
     # Out
     centres: wp.array[wp.vec3],
@@ -202,26 +192,26 @@ def find_turns(
     1 + dt [w] with the angular velocity w, by atan(dt |w|). It is zero for bodies with held nodes.
     """
     world, lane = wp.tid()
-    sums = Sums()
+    motion = Motion()
     for column in range(MOTION_COLUMNS):
-        sums[column] = add_up(parts, world, lane, lanes, column)
+        motion[column] = add_up(sums, world, lane, column)
     if lane > 0:
         return
     centres[world] = wp.vec3()
     turns[world] = wp.mat33()
-    m = sums[MASS]
-    if not m > wp.float64(0.0) or sums[HELD] > wp.float64(0.0):
+    m = motion[MASS]
+    if not m > wp.float64(0.0) or motion[HELD] > wp.float64(0.0):
         return
-    first = wp.vec3d(sums[FIRST], sums[FIRST + 1], sums[FIRST + 2])
-    momentum = wp.vec3d(sums[MOMENTUM], sums[MOMENTUM + 1], sums[MOMENTUM + 2])
+    first = wp.vec3d(motion[FIRST], motion[FIRST + 1], motion[FIRST + 2])
+    momentum = wp.vec3d(motion[MOMENTUM], motion[MOMENTUM + 1], motion[MOMENTUM + 2])
     c = first / m
-    spin = wp.vec3d(sums[SPIN], sums[SPIN + 1], sums[SPIN + 2]) - wp.cross(c, momentum)
-    xx = sums[SQUARES] - first[0] * c[0]
-    yy = sums[SQUARES + 1] - first[1] * c[1]
-    zz = sums[SQUARES + 2] - first[2] * c[2]
-    xy = sums[SQUARES + 3] - first[0] * c[1]
-    yz = sums[SQUARES + 4] - first[1] * c[2]
-    zx = sums[SQUARES + 5] - first[2] * c[0]
+    spin = wp.vec3d(motion[SPIN], motion[SPIN + 1], motion[SPIN + 2]) - wp.cross(c, momentum)
+    xx = motion[SQUARES] - first[0] * c[0]
+    yy = motion[SQUARES + 1] - first[1] * c[1]
+    zz = motion[SQUARES + 2] - first[2] * c[2]
+    xy = motion[SQUARES + 3] - first[0] * c[1]
+    yz = motion[SQUARES + 4] - first[1] * c[2]
+    zx = motion[SQUARES + 5] - first[2] * c[0]
     w = dt * (wp.inverse(wp.mat33d(yy + zz, -xy, -zx, -xy, zz + xx, -yz, -zx, -yz, xx + yy)) * spin)
     square = wp.dot(w, w)
     # False if it is not finite.

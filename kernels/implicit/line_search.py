@@ -8,8 +8,7 @@ whole change.
 import warp as wp
 
 from warp_corot.kernels.elements.elements import load_node, store_node
-
-from .conjugate_gradients import add_up
+from warp_corot.kernels.stepping.sums import Sums, add_up
 
 wp.set_module_options({"enable_backward": False})
 
@@ -31,9 +30,8 @@ BENT = wp.constant(wp.float64(4.0))
 @wp.kernel(enable_backward=False)
 def begin_search(
     # In
-    power: wp.array3d[wp.float64],
-    loss: wp.array3d[wp.float64],
-    lanes: int,
+    power: Sums,
+    loss: Sums,
     # Out
     search: wp.array2d[wp.float64],
     slopes: wp.array[wp.float64],
@@ -41,8 +39,8 @@ def begin_search(
 ):
     """Begin with a fraction of zero; ``searching`` counts the worlds that search."""
     world, lane = wp.tid()
-    first = add_up(power, world, lane, lanes, 0)
-    second = add_up(loss, world, lane, lanes, 0)
+    first = add_up(power, world, lane, 0)
+    second = add_up(loss, world, lane, 0)
     if lane == 0:
         search[world, POWER] = first
         search[world, LOSS] = second
@@ -50,7 +48,7 @@ def begin_search(
         search[world, NUMBER] = wp.float64(0.0)
         slopes[world] = wp.float64(0.0)
         if world == 0:
-            searching[0] = power.shape[0]
+            searching[0] = power.parts.shape[0]
 
 
 @wp.func

@@ -8,9 +8,9 @@ the others. The device decides from each world's scalars, so an iteration can be
 import warp as wp
 
 from warp_corot.kernels.elements.elements import load_node, store_node
-from warp_corot.kernels.stepping.balance import most_of_lanes, sum_of_lanes
+from warp_corot.kernels.stepping.sums import Sums, add_up, dot64, largest, store_most, store_sum
 
-from .conjugate_gradients import NEGATIVE, add_up, dot64, is_number
+from .conjugate_gradients import NEGATIVE, is_number, stop
 
 wp.set_module_options({"enable_backward": False})
 
@@ -42,17 +42,12 @@ NEAR = wp.constant(wp.float64(1e-3))
 
 @wp.kernel(enable_backward=False)
 def measure_step(
-    # In
+    sums: Sums,
     mass: wp.array[wp.float32],
     r: wp.array[wp.vec4],
     outer: wp.array[wp.vec4],
     step: wp.array[wp.vec4],
     u: wp.array[wp.vec4],
-    count: int,
-    threads: int,
-    lanes: int,
-    # Out
-    parts: wp.array3d[wp.float64],
 ):
     """Find parts of r . step, outer . step and step . M step, and the largest |step|^2 and |u|^2."""
     world, thread = wp.tid()
@@ -61,9 +56,8 @@ def measure_step(
     inertia = wp.float64(0.0)
     longest = wp.float64(0.0)
     reach = wp.float64(0.0)
-    k = thread
-    while k < count:
-        i = world * count + k
+    for k in range(thread, sums.count, sums.threads):
+        i = world * sums.count + k
         s = load_node(step, i)
         x = load_node(u, i)
         square = dot64(s, s)
@@ -72,50 +66,21 @@ def measure_step(
         inertia += wp.float64(mass[i]) * square
         longest = wp.max(longest, square)
         reach = wp.max(reach, dot64(x, x))
-        k += threads
-    slope = sum_of_lanes(slope)
-    work = sum_of_lanes(work)
-    inertia = sum_of_lanes(inertia)
-    longest = most_of_lanes(longest)
-    reach = most_of_lanes(reach)
-    if thread % lanes == 0:
-        part = thread / lanes
-        parts[world, part, SLOPE] = slope
-        parts[world, part, OUTER] = work
-        parts[world, part, INERTIA] = inertia
-        parts[world, part, STEP] = longest
-        parts[world, part, REACH] = reach
+    store_sum(sums, world, thread, SLOPE, slope)
+    store_sum(sums, world, thread, OUTER, work)
+    store_sum(sums, world, thread, INERTIA, inertia)
+    store_most(sums, world, thread, STEP, longest)
+    store_most(sums, world, thread, REACH, reach)
 
 
 @wp.kernel(enable_backward=False)
-def sum_energies(energies: wp.array[wp.float64], count: int, threads: int, lanes: int, parts: wp.array3d[wp.float64]):
+def sum_energies(sums: Sums, energies: wp.array[wp.float64], count: int):
     """Find parts of strain energies, ``count`` for each world."""
     world, thread = wp.tid()
     total = wp.float64(0.0)
-    k = thread
-    while k < count:
+    for k in range(thread, count, sums.threads):
         total += energies[world * count + k]
-        k += threads
-    total = sum_of_lanes(total)
-    if thread % lanes == 0:
-        parts[world, thread / lanes, ENERGY] = total
-
-
-@wp.func
-def largest(parts: wp.array3d[wp.float64], world: int, lane: int, lanes: int, column: int):
-    """The largest of a world's parts, in the first lane."""
-    most = wp.float64(0.0)
-    k = lane
-    while k < parts.shape[1]:
-        most = wp.max(most, parts[world, k, column])
-        k += lanes
-    return most_of_lanes(most)
-
-
-@wp.func
-def stop(status: wp.array[wp.int32], running: wp.array[wp.int32], world: int, how: int):
-    status[world] = how
-    wp.atomic_sub(running, 0, 1)
+    store_sum(sums, world, thread, ENERGY, total)
 
 
 @wp.kernel(enable_backward=False)
@@ -139,8 +104,7 @@ def begin_worlds(
 @wp.kernel(enable_backward=False)
 def judge_residual(
     # In
-    parts: wp.array3d[wp.float64],
-    lanes: int,
+    sums: Sums,
     tolerance: wp.float64,
     most: int,
     # In and out
@@ -158,9 +122,9 @@ def judge_residual(
     get a tolerance of one.
     """
     world, lane = wp.tid()
-    square = add_up(parts, world, lane, lanes, SQUARE)
-    reference = add_up(parts, world, lane, lanes, REFERENCE)
-    energy = add_up(parts, world, lane, lanes, ENERGY)
+    square = add_up(sums, world, lane, SQUARE)
+    reference = add_up(sums, world, lane, REFERENCE)
+    energy = add_up(sums, world, lane, ENERGY)
     if lane == 0:
         solve_tolerance[world] = wp.float64(1.0)
         if status[world] == RUNNING:
@@ -194,8 +158,7 @@ def judge_residual(
 @wp.kernel(enable_backward=False)
 def begin_search(
     # In
-    parts: wp.array3d[wp.float64],
-    lanes: int,
+    sums: Sums,
     inner: wp.array[wp.int32],
     # In and out
     scalars: wp.array2d[wp.float64],
@@ -208,7 +171,7 @@ def begin_search(
 ):
     """Try the whole step in every running world; a step that does not go downhill is dropped."""
     world, lane = wp.tid()
-    slope = add_up(parts, world, lane, lanes, SLOPE)
+    slope = add_up(sums, world, lane, SLOPE)
     if lane == 0:
         scalars[world, SHARE] = wp.float64(0.0)
         scalars[world, SLOPE_NOW] = slope
@@ -249,8 +212,7 @@ def try_step(
 @wp.kernel(enable_backward=False)
 def judge_trial(
     # In
-    parts: wp.array3d[wp.float64],
-    lanes: int,
+    sums: Sums,
     inertia: wp.array[wp.float32],
     status: wp.array[wp.int32],
     # In and out
@@ -264,9 +226,9 @@ def judge_trial(
     parabola through Pi's values and its slope.
     """
     world, lane = wp.tid()
-    energy = add_up(parts, world, lane, lanes, ENERGY)
-    square = add_up(parts, world, lane, lanes, INERTIA)
-    work = add_up(parts, world, lane, lanes, OUTER)
+    energy = add_up(sums, world, lane, ENERGY)
+    square = add_up(sums, world, lane, INERTIA)
+    work = add_up(sums, world, lane, OUTER)
     if lane == 0 and status[world] == RUNNING and accepted[world] == 0:
         share = scalars[world, SHARE]
         slope = scalars[world, SLOPE_NOW]
@@ -293,8 +255,7 @@ def judge_trial(
 @wp.kernel(enable_backward=False)
 def judge_step(
     # In
-    parts: wp.array3d[wp.float64],
-    lanes: int,
+    sums: Sums,
     tolerance: wp.float64,
     inner_status: wp.array[wp.int32],
     # In and out
@@ -308,8 +269,8 @@ def judge_step(
     accurately.
     """
     world, lane = wp.tid()
-    longest = largest(parts, world, lane, lanes, STEP)
-    reach = largest(parts, world, lane, lanes, REACH)
+    longest = largest(sums, world, lane, STEP)
+    reach = largest(sums, world, lane, REACH)
     if lane == 0 and status[world] == RUNNING:
         correction = wp.sqrt(longest) / wp.max(wp.sqrt(reach), wp.float64(1e-30))
         scalars[world, CORRECTION] = correction

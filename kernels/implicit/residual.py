@@ -1,14 +1,11 @@
 """The residual of Newton's method; see ``newton``, of which steps with one iteration launch nothing else."""
 
-from typing import Any
-
 import warp as wp
 
 from warp_corot.kernels.elements.elements import load_node, store_node
-from warp_corot.kernels.stepping.balance import sum_of_lanes
-from warp_corot.kernels.stepping.integrate import by_vectors, vector_at
+from warp_corot.kernels.stepping.integrate import Dynamics, load_at
+from warp_corot.kernels.stepping.sums import Sums, dot64, store_sum
 
-from .conjugate_gradients import dot64
 from .newton import REFERENCE, SQUARE
 
 wp.set_module_options({"enable_backward": False})
@@ -17,45 +14,34 @@ wp.set_module_options({"enable_backward": False})
 @wp.kernel(enable_backward=False)
 def find_residual(
     # In
-    gravity: wp.vec3,
+    sums: Sums,
+    body: Dynamics,
     mass: wp.array[wp.float32],
-    inverse_mass: wp.array[wp.float32],
-    has_load: int,
-    load: wp.array[Any],
     external_share: wp.array[wp.float32],
     inertia: wp.array[wp.float32],
     pull: wp.array[wp.vec4],
     increment: wp.array[wp.vec4],
-    count: int,
-    threads: int,
-    lanes: int,
     # In and out
     f: wp.array[wp.vec4],
-    others: wp.array[wp.vec4],
     # Out
     r: wp.array[wp.vec4],
     outer: wp.array[wp.vec4],
-    parts: wp.array3d[wp.float64],
 ):
-    """r = f + outer at free nodes, outer = others + external + m (pull - a d).
+    """r = f + outer at free nodes, outer = others + external + m (pull - a d), with the other forces in ``body``.
 
     Afterwards f and the other forces are zero, ready for the next sums.
     """
     world, thread = wp.tid()
     square = wp.float64(0.0)
     reference = wp.float64(0.0)
-    k = thread
-    while k < count:
-        i = world * count + k
+    for k in range(thread, sums.count, sums.threads):
+        i = world * sums.count + k
         internal = load_node(f, i)
-        other = load_node(others, i)
-        external = mass[i] * gravity
-        if has_load != 0:
-            external += vector_at(load, i)
-        external = external_share[0] * external
+        other = load_node(body.f, i)
+        external = external_share[0] * (mass[i] * body.gravity + load_at(i, body))
         rest = wp.vec3()
         push = wp.vec3()
-        if inverse_mass[i] > 0.0:
+        if body.inverse_mass[i] > 0.0:
             external += other + mass[i] * load_node(pull, i)
             push = external - (inertia[0] * mass[i]) * load_node(increment, i)
             rest = internal + push
@@ -66,13 +52,6 @@ def find_residual(
         store_node(r, i, rest)
         store_node(outer, i, push)
         store_node(f, i, wp.vec3())
-        store_node(others, i, wp.vec3())
-        k += threads
-    square = sum_of_lanes(square)
-    reference = sum_of_lanes(reference)
-    if thread % lanes == 0:
-        parts[world, thread / lanes, SQUARE] = square
-        parts[world, thread / lanes, REFERENCE] = reference
-
-
-FIND_RESIDUAL = by_vectors(find_residual, "load")
+        store_node(body.f, i, wp.vec3())
+    store_sum(sums, world, thread, SQUARE, square)
+    store_sum(sums, world, thread, REFERENCE, reference)

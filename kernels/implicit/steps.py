@@ -5,12 +5,10 @@ and h2 of the step before, such as its acceleration. The first table is for a st
 second for a first step.
 """
 
-from typing import Any
-
 import warp as wp
 
 from warp_corot.kernels.elements.elements import load_node, store_node
-from warp_corot.kernels.stepping.integrate import by_vectors, count_support_work, is_finite, vector_at
+from warp_corot.kernels.stepping.integrate import Dynamics, count_support_work, force_at, is_finite
 from warp_corot.kernels.stepping.pace import DONE, DT, Pace
 
 from .conjugate_gradients import BROKEN
@@ -238,26 +236,20 @@ def end_step(
 @wp.kernel(enable_backward=False)
 def count_supports(
     # In
-    gravity: wp.vec3,
+    body: Dynamics,
     mass: wp.array[wp.float32],
-    inverse_mass: wp.array[wp.float32],
-    has_load: int,
-    load: wp.array[Any],
     elastic: wp.array[wp.vec4],
-    others: wp.array[wp.vec4],
     increment: wp.array[wp.vec4],
     # Out
     reactions: wp.array[wp.vec4],
     support_work: wp.array[wp.float64],
 ):
-    """Find the forces of supports after the step, and the work of moving ones against elastic forces."""
+    """Find the forces of supports after the step, and the work of moving ones against elastic forces; the other forces
+    are in ``body``."""
     i = wp.tid()
-    if inverse_mass[i] == 0.0:
+    if body.inverse_mass[i] == 0.0:
         force = load_node(elastic, i)
-        total = force + load_node(others, i) + mass[i] * gravity
-        if has_load != 0:
-            total += vector_at(load, i)
-        store_node(reactions, i, -total)
+        store_node(reactions, i, -(force + force_at(i, body) + mass[i] * body.gravity))
         count_support_work(force, load_node(increment, i), i, support_work)
 
 
@@ -299,6 +291,3 @@ def count_solves(
     totals[1] = totals[1] + wp.int64(most)
     totals[2] = totals[2] + wp.int64(linear)
     totals[3] = totals[3] + wp.int64(unfinished)
-
-
-COUNT_SUPPORTS = by_vectors(count_supports, "load")

@@ -28,10 +28,10 @@ from warp_corot.kernels.corotated.tangent import keep_gradients
 from warp_corot.kernels.elements.constitutive import hooke, symmetric
 from warp_corot.kernels.elements.elements import GeneralElements, add_force, load_node, store_node
 from warp_corot.kernels.implicit.assembled import root_columns
-from warp_corot.kernels.implicit.increments import MOTION_COLUMNS, Sums, motion_of
+from warp_corot.kernels.implicit.increments import MOTION_COLUMNS, Motion, motion_of
 from warp_corot.kernels.implicit.line_search import TRIED
 from warp_corot.kernels.math.rotation import byers_xu, identity3
-from warp_corot.kernels.stepping.balance import sum_of_lanes
+from warp_corot.kernels.stepping.sums import Sums, store_sum
 
 from .elements import difference_gradient, viscous_product
 from .particles import (
@@ -244,33 +244,25 @@ def add_first(
 
 @wp.kernel(enable_backward=False)
 def sum_motion(
-    # In
+    sums: Sums,
     first: wp.array[wp.int32],
     members: wp.array[wp.int32],
     particles: Particles,
     q: wp.array[wp.vec3],
     qd: wp.array[wp.vec3],
-    threads: int,
-    lanes: int,
-    # Out
-    parts: wp.array3d[wp.float64],
 ):
     """Find parts of the sums of each piece, whose particles begin at ``first`` among the members."""
     piece, thread = wp.tid()
-    total = Sums()
-    k = first[piece] + thread
-    while k < first[piece + 1]:
+    total = Motion()
+    for k in range(first[piece] + thread, first[piece + 1], sums.threads):
         i = members[k]
         if is_moved(i, particles):
             mass = wp.float64(1.0) / wp.float64(particles.inv_mass[i])
             total += motion_of(mass, False, wp.vec3d(q[i]), wp.vec3d(qd[i]))
         else:
             total += motion_of(wp.float64(0.0), True, wp.vec3d(), wp.vec3d())
-        k += threads
     for column in range(MOTION_COLUMNS):
-        part = sum_of_lanes(total[column])
-        if thread % lanes == 0:
-            parts[piece, thread / lanes, column] = part
+        store_sum(sums, piece, thread, column, total[column])
 
 
 @wp.kernel(enable_backward=False)

@@ -95,15 +95,7 @@ def find_starts(
 ):
     """The start of each level among ``count`` nodes sorted by level."""
     wanted = wp.tid()
-    low = int(0)
-    high = int(count)
-    while low < high:
-        middle = low + (high - low) / 2
-        if level[middle] < wanted:
-            low = middle + 1
-        else:
-            high = middle
-    starts[wanted] = low
+    starts[wanted] = wp.lower_bound(level, 0, count + 1, wanted)
 
 
 @wp.kernel(enable_backward=False)

@@ -15,6 +15,7 @@ from warp_corot.kernels.elements.elements import load_node, store_node
 
 from .integrate import Dynamics, by_vectors, force_at, load_at, symplectic_euler_velocity, vector_at
 from .pace import BEFORE, CONTROLS, DONE, DONE_THEN, DT, END, SLOT, THEN, Pace, length_before, time_after
+from .sums import Sums, add_most, add_sum, add_up, dot64, largest
 
 wp.set_module_options({"enable_backward": False})
 
@@ -137,28 +138,6 @@ NUMBERS = 9 + CONTROLS
 NEAR = wp.constant(wp.float64(1e-4))
 
 
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-    for (int k = 16; k > 0; k >>= 1) value += __shfl_down_sync(0xffffffffu, value, k);
-#endif
-    return value;
-""")
-def sum_of_lanes(value: wp.float64) -> wp.float64:
-    """The sum over the warp, in a fixed order, in the first lane; a CPU has one lane."""
-    ...
-
-
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-    for (int k = 16; k > 0; k >>= 1) value = fmax(value, __shfl_down_sync(0xffffffffu, value, k));
-#endif
-    return value;
-""")
-def most_of_lanes(value: wp.float64) -> wp.float64:
-    """The largest value of the warp, in the first lane."""
-    ...
-
-
 @wp.func
 def equal(a: wp.vec3, b: wp.vec3):
     """False if any component is NaN."""
@@ -209,23 +188,15 @@ def is_zero(a: wp.vec3):
     return a[0] == 0.0 and a[1] == 0.0 and a[2] == 0.0
 
 
-@wp.func
-def dot64(a: wp.vec3, b: wp.vec3):
-    return (
-        wp.float64(a[0]) * wp.float64(b[0]) + wp.float64(a[1]) * wp.float64(b[1]) + wp.float64(a[2]) * wp.float64(b[2])
-    )
-
-
 @wp.kernel(enable_backward=False)
 def sum_nodes(
     # In
+    sums: Sums,
     pace: Pace,
     lag: wp.float64,
     body: Dynamics,
     mass: wp.array[wp.float32],
     count: int,
-    threads: int,
-    lanes: int,
     pushed: int,
     others: wp.array[wp.vec4],
     constrained: int,
@@ -235,7 +206,6 @@ def sum_nodes(
     # In and out
     kept_u: wp.array2d[wp.vec4],
     kept_v: wp.array2d[wp.vec4],
-    sums: wp.array3d[wp.float64],
 ):
     """Add up over free nodes: kinetic and gravitational energy, the work of loads since the last good state, the
     largest displacement. If ``keeps``, keep the present state beside the last good one.
@@ -263,8 +233,7 @@ def sum_nodes(
     supports = wp.float64(0.0)
     untimely = wp.float64(0.0)
     reach = wp.float64(0.0)
-    k = thread
-    while k < count:
+    for k in range(thread, count, sums.threads):
         i = world * count + k
         x = load_node(body.u, i)
         reach = wp.max(reach, dot64(x, x))
@@ -293,47 +262,25 @@ def sum_nodes(
         if keeps != 0:
             store_node(kept_u[1 - slot], i, x)
             store_node(kept_v[1 - slot], i, velocity)
-        k += threads
-    untimely = wp.float64(0.125) * dt * dt * untimely
-    reach = wp.sqrt(reach)
-    # With one lane, each thread adds to its own place.
-    if lanes > 1:
-        kinetic = sum_of_lanes(kinetic)
-        ahead = sum_of_lanes(ahead)
-        gravitational = sum_of_lanes(gravitational)
-        work = sum_of_lanes(work)
-        supports = sum_of_lanes(supports)
-        untimely = sum_of_lanes(untimely)
-        reach = most_of_lanes(reach)
-    if thread % lanes == 0:
-        part = thread / lanes
-        sums[world, part, KINETIC] = sums[world, part, KINETIC] + kinetic
-        sums[world, part, AHEAD] = sums[world, part, AHEAD] + ahead
-        sums[world, part, GRAVITATIONAL] = sums[world, part, GRAVITATIONAL] + gravitational
-        sums[world, part, LOADS] = sums[world, part, LOADS] + work
-        sums[world, part, SUPPORTS] = sums[world, part, SUPPORTS] + supports
-        sums[world, part, UNTIMELY] = sums[world, part, UNTIMELY] + untimely
-        sums[world, part, REACH] = wp.max(sums[world, part, REACH], reach)
+    add_sum(sums, world, thread, KINETIC, kinetic)
+    add_sum(sums, world, thread, AHEAD, ahead)
+    add_sum(sums, world, thread, GRAVITATIONAL, gravitational)
+    add_sum(sums, world, thread, LOADS, work)
+    add_sum(sums, world, thread, SUPPORTS, supports)
+    add_sum(sums, world, thread, UNTIMELY, wp.float64(0.125) * dt * dt * untimely)
+    add_most(sums, world, thread, REACH, wp.sqrt(reach))
 
 
 @wp.kernel(enable_backward=False)
-def sum_rows(
-    rows: wp.array2d[wp.float64], count: int, threads: int, lanes: int, column: int, sums: wp.array3d[wp.float64]
-):
+def sum_rows(sums: Sums, rows: wp.array2d[wp.float64], count: int, column: int):
     """Add up rows of numbers, ``count`` of each world, in one column each: strain energies, or the work of constraints
     and its absolute value."""
     world, thread = wp.tid()
     for row in range(rows.shape[0]):
         total = wp.float64(0.0)
-        k = thread
-        while k < count:
+        for k in range(thread, count, sums.threads):
             total += rows[row, world * count + k]
-            k += threads
-        if lanes > 1:
-            total = sum_of_lanes(total)
-        if thread % lanes == 0:
-            part = thread / lanes
-            sums[world, part, column + row] = sums[world, part, column + row] + total
+        add_sum(sums, world, thread, column + row, total)
 
 
 @wp.kernel(enable_backward=False)
@@ -349,7 +296,7 @@ def keep_words(words: wp.array[wp.uint32], orders: wp.array[wp.float64], beside:
 @wp.kernel(enable_backward=False)
 def report(
     # In
-    lanes: int,
+    sums: Sums,
     orders: wp.array[wp.float64],
     support_work: wp.array[wp.float64],
     bad_step: wp.array[wp.int64],
@@ -357,7 +304,6 @@ def report(
     control: wp.array[wp.float64],
     # In and out
     pace: Pace,
-    sums: wp.array3d[wp.float64],
     # Out
     totals: wp.array2d[wp.float64],
     numbers: wp.array[wp.float64],
@@ -367,21 +313,11 @@ def report(
     If the run has reached its end, the time is exactly ``END``.
     """
     world, column, lane = wp.tid()
-    value = wp.float64(0.0)
-    k = lane
-    while k < sums.shape[1]:
-        part = sums[world, k, column]
-        sums[world, k, column] = wp.float64(0.0)
-        if column == REACH:
-            value = wp.max(value, part)
-        else:
-            value += part
-        k += lanes
-    together = value
-    if lanes > 1:
-        together = sum_of_lanes(value)
-        if column == REACH:
-            together = most_of_lanes(value)
+    together = add_up(sums, world, lane, column)
+    if column == REACH:
+        together = largest(sums, world, lane, column)
+    for k in range(lane, sums.parts.shape[1], sums.lanes):
+        sums.parts[world, k, column] = wp.float64(0.0)
     if lane == 0:
         totals[world, column] = together
         if world == 0 and column == 0:

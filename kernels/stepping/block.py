@@ -45,30 +45,15 @@ from warp_corot.kernels.tables.block_layout import (
 from warp_corot.kernels.tables.shapes import VOLUME, fingerprint
 from warp_corot.kernels.tables.subtree import HANDEDNESS, LEAVES, POSITIONS
 
-from .block_memory import (
-    CLEAR,
-    COUNT,
-    LOAD,
-    LOAD_BYTES,
-    READ,
-    RESERVE,
-    STORE,
-    WRITE,
-    shared_list,
-    shared_numbers,
-    shared_vectors,
-)
+from .block_memory import LOAD, LOAD_BYTES, STORE, shared_array
 from .integrate import Dynamics, add_support_work, is_finite, load_at, symplectic_euler_velocity
 from .pace import DONE, DT, Pace, length_before
-from .threads import bit_count, lowest_bit, number_in, shuffle_down, synchronize_any, synchronize_block
+from .threads import lowest_bit, number_in, shuffle_down, synchronize_block
 
 wp.set_module_options({"enable_backward": False})
 
 #: The number of threads for which a multiprocessor's registers must have room.
 BUSY_THREADS = 640
-
-#: An entry of a block's list is the thread that left a leaf out, and from this bit on the number of the leaf.
-LEAF_SHIFT = 16
 
 vec3u = wp.types.vector(length=NODE_WORDS, dtype=wp.uint64)
 
@@ -131,32 +116,13 @@ def _displacements_of(layout: Layout, part: int, displacement: wp.Function) -> w
     return displacements
 
 
-def _left_out_of(layout: Layout, displacement: wp.Function, slot: wp.Function) -> tuple[wp.Function, ...]:
-    """The list of left-out leaves, and functions that fill it, compute a leaf of it and collect forces.
-
-    The threads of the subtrees list the leaves that they leave out. Any thread computes the forces of a listed leaf.
-    The thread that left it out adds them to its slots, so that sums have a fixed order.
-    """
-    shape, room = layout.shape, layout.room
+def _left_out_of(layout: Layout, displacement: wp.Function, slot: wp.Function) -> wp.Function:
+    """A function that adds the forces of leaves that the closed form leaves out to the slots of their thread."""
+    shape = layout.shape
     node_of, place_of = _table([list(leaf) for leaf in LEAVES[shape]]), _table(layout.places)
     handed = _table([[int(h)] for h in HANDEDNESS[shape]])
     rest_of = _vectors([[2.0 * c for c in point] for point in POSITIONS[shape]])
     columns, leaf_forces = columns_of(shape), leaf_forces_of(shape)
-    waiting, force = shared_list(room), shared_vectors(4 * room, "forces of single leaves")
-
-    @wp.func
-    def enlist(thread: int, degenerate: int):
-        """List a thread's left-out leaves as far as there is room, and return the place of the first."""
-        first = int(0)
-        if degenerate != 0:
-            first = waiting(wp.static(RESERVE), 0, bit_count(degenerate))
-            i = int(first)
-            left = int(degenerate)
-            while left != 0 and i < wp.static(room):
-                waiting(wp.static(WRITE), i, thread | (lowest_bit(left) << wp.static(LEAF_SHIFT)))
-                left = left & (left - 1)
-                i += 1
-        return first
 
     @wp.func
     def position(words: vec3u, k: int, q: wp.mat33, inv_h: float):
@@ -168,53 +134,45 @@ def _left_out_of(layout: Layout, displacement: wp.Function, slot: wp.Function) -
         return (moved - origin) * inv_h + q * rest_of(k)
 
     @wp.func
-    def do_one(body: BlockBody, i: int, material: IsotropicMaterial, first: int):
-        """Find the forces of the i-th listed leaf, for any F; ``first`` is the place of the world's first material."""
-        entry = waiting(wp.static(READ), i, 0)
-        leaf = entry >> wp.static(LEAF_SHIFT)
-        warp = (entry & wp.static((1 << LEAF_SHIFT) - 1)) // wp.static(WARP)
-        s = (warp // wp.static(layout.parts)) * wp.static(WARP) + entry % wp.static(WARP)
-        h, q, mirror = root_of(body.subtrees, s)
-        # Left-handed if ``mirror`` is -1.
-        maubach = wp.matrix_from_cols(column(q, 0), column(q, 1), column(q, 2) * mirror)
-        words = vec3u(body.nodes[0, s], body.nodes[1, s], body.nodes[2, s])
-        inv_h = 1.0 / h
-        area = wp.static(VOLUME[shape]) * h * h
-        at = first + (body.subtrees.first[s] + leaf) * material.stride
-        m = area * material.mu[at]
-        # A dilatation that leaves share has its own forces.
-        k = wp.static(0.0 if layout.dilating else 1.0) * area * material.lam[at]
-        c0, c1, c2 = columns(
-            position(words, node_of(leaf, 0), maubach, inv_h),
-            position(words, node_of(leaf, 1), maubach, inv_h),
-            position(words, node_of(leaf, 2), maubach, inv_h),
-            position(words, node_of(leaf, 3), maubach, inv_h),
-        )
-        hand = mirror * float(handed(leaf, 0))
-        p = turned_stress(wp.matrix_from_cols(c0, c1, c2 * hand), m, k)
-        f0, f1, f2, f3 = leaf_forces(column(p, 0), column(p, 1), hand * column(p, 2))
-        force(wp.static(STORE), 4 * i, f0)
-        force(wp.static(STORE), 4 * i + 1, f1)
-        force(wp.static(STORE), 4 * i + 2, f2)
-        force(wp.static(STORE), 4 * i + 3, f3)
+    def add_to_slot(s: int, part: int, node: int, force: wp.vec3):
+        at = s + place_of(part, node) * wp.static(layout.subtrees)
+        slot(wp.static(STORE), at, slot(wp.static(LOAD), at, force) + force)
 
     @wp.func
-    def collect(s: int, part: int, first: int, degenerate: int):
-        """Add the forces of a thread's listed leaves to its slots, and return the leaves for which there was no
-        room."""
+    def add_left_out(
+        body: BlockBody, s: int, part: int, degenerate: int, material: IsotropicMaterial, first_of_world: int
+    ):
+        """Add these forces, for any F; everything is read again, so that nothing is kept for this."""
+        h, q, mirror = root_of(body.subtrees, s)
+        words = vec3u(body.nodes[0, s], body.nodes[1, s], body.nodes[2, s])
+        first = first_of_world + body.subtrees.first[s] * material.stride
+        # Left-handed if ``mirror`` is -1.
+        maubach = wp.matrix_from_cols(column(q, 0), column(q, 1), column(q, 2) * mirror)
+        inv_h = 1.0 / h
+        area = wp.static(VOLUME[shape]) * h * h
         left = int(degenerate)
-        i = int(first)
-        while left != 0 and i < wp.static(room):
+        while left != 0:
             leaf = lowest_bit(left)
             left = left & (left - 1)
-            for n in range(4):
-                at = s + place_of(part, node_of(leaf, n)) * wp.static(layout.subtrees)
-                added = force(wp.static(LOAD), 4 * i + n, wp.vec3())
-                slot(wp.static(STORE), at, slot(wp.static(LOAD), at, added) + added)
-            i += 1
-        return left
+            at = first + leaf * material.stride
+            m = area * material.mu[at]
+            # A dilatation that leaves share has its own forces.
+            k = wp.static(0.0 if layout.dilating else 1.0) * area * material.lam[at]
+            c0, c1, c2 = columns(
+                position(words, node_of(leaf, 0), maubach, inv_h),
+                position(words, node_of(leaf, 1), maubach, inv_h),
+                position(words, node_of(leaf, 2), maubach, inv_h),
+                position(words, node_of(leaf, 3), maubach, inv_h),
+            )
+            hand = mirror * float(handed(leaf, 0))
+            p = turned_stress(wp.matrix_from_cols(c0, c1, c2 * hand), m, k)
+            f0, f1, f2, f3 = leaf_forces(column(p, 0), column(p, 1), hand * column(p, 2))
+            add_to_slot(s, part, node_of(leaf, 0), f0)
+            add_to_slot(s, part, node_of(leaf, 1), f1)
+            add_to_slot(s, part, node_of(leaf, 2), f2)
+            add_to_slot(s, part, node_of(leaf, 3), f3)
 
-    return waiting, enlist, do_one, collect
+    return add_left_out
 
 
 @functools.cache
@@ -228,16 +186,16 @@ def step_block(layout: Layout) -> wp.Kernel:
     capacity, threads, zero_slot = layout.subtrees, layout.threads, layout.slot_count
     own = [own_forces(shape, uniform, chosen=layout.leaves(part)) for part in range(parts)]
     needs, places = [layout.needs(part) for part in range(parts)], layout.places
-    displacement, velocity = shared_vectors(layout.nodes, "displacements"), shared_vectors(layout.nodes, "velocities")
+    displacement, velocity = shared_array(layout.nodes, "displacements"), shared_array(layout.nodes, "velocities")
     displacements = [_displacements_of(layout, part, displacement) for part in range(parts)]
-    slot = shared_vectors(zero_slot + 1, "forces")
+    slot = shared_array(zero_slot + 1, "forces")
     slope_of = VOLUME_CHANGE.slope
     measure = [dilatation_sums_of(shape, uniform, VOLUME_CHANGE, layout.leaves(part)) for part in range(parts)]
     # Law and pressure are one pass, after a first pass for the sums if two threads share a subtree.
     law = dilating_leaves(shape)
     dilate = [subtree_forces(shape, uniform, law, layout.leaves(part)) for part in range(parts)]
-    sums = shared_numbers(max(layout.sum_count, 1), "sums of dilatations")
-    waiting, enlist, do_one, collect = _left_out_of(layout, displacement, slot)
+    sums = shared_array(max(layout.sum_count, 1), "sums of dilatations", float)
+    add_left_out = _left_out_of(layout, displacement, slot)
 
     @law_kernel(
         grid_stride=False,
@@ -269,7 +227,6 @@ def step_block(layout: Layout) -> wp.Kernel:
             place += wp.static(threads)
         if thread == 0:
             slot(wp.static(STORE), wp.static(zero_slot), wp.vec3())
-            waiting(wp.static(CLEAR), 0, 0)
         synchronize_block()
         warp = thread // wp.static(WARP)
         part = warp % wp.static(parts)
@@ -325,16 +282,9 @@ def step_block(layout: Layout) -> wp.Kernel:
                         for k in range(10):
                             if wp.static(places[p][k] >= 0):
                                 slot(wp.static(STORE), s + wp.static(places[p][k] * capacity), g[k])
-            listed = enlist(thread, degenerate)
-            while synchronize_any(degenerate) != 0:
-                if thread < waiting(wp.static(COUNT), 0, 0):
-                    do_one(body, thread, material, first_of_world)
-                synchronize_block()
-                degenerate = collect(s, part, listed, degenerate)
-                if thread == 0:
-                    waiting(wp.static(CLEAR), 0, 0)
-                synchronize_block()
-                listed = enlist(thread, degenerate)
+                if degenerate != 0:
+                    add_left_out(body, s, part, degenerate, material, first_of_world)
+            synchronize_block()
             task = thread
             while task < wp.static(layout.tasks):
                 if wp.static(layout.tasks > threads):

@@ -28,7 +28,7 @@ from warp_corot.kernels.elements.simd8 import law_kernel
 from warp_corot.kernels.math.matrices import column, identity3
 from warp_corot.kernels.tables.shapes import fingerprint
 
-from .block_memory import LOAD, STORE, numbers_at, vectors_at
+from .block_memory import LOAD, STORE, array_at
 from .integrate import Dynamics, add_support_work, is_finite, load_at, symplectic_euler_velocity
 from .pace import DONE, DT, Pace, length_before, time_after
 from .threads import lowest_bit, number_in, shuffle_down, synchronize_any, synchronize_block
@@ -184,14 +184,14 @@ def step_patches(layout: Layout) -> wp.Kernel:
     Args:
     """
     threads, each, halo_each, lanes = layout.threads, layout.elements, layout.halo, layout.lanes
-    slot, displacement = vectors_at(0), vectors_at(layout.slots + 1)
+    slot, displacement = array_at(0), array_at(3 * (layout.slots + 1))
     # Weighted dilatations and weights of elements, inverse weights of groups, and pressures of groups.
     shares, groups, members = layout.groups > 0, layout.groups, layout.members
     first_number = 3 * layout.vectors
-    measured = numbers_at(first_number)
-    weight_of = numbers_at(first_number + groups * members)
-    inverse_weight = numbers_at(first_number + groups * 2 * members)
-    pressure_of = numbers_at(first_number + groups * (2 * members + 1))
+    measured = array_at(first_number, float)
+    weight_of = array_at(first_number + groups * members, float)
+    inverse_weight = array_at(first_number + groups * 2 * members, float)
+    pressure_of = array_at(first_number + groups * (2 * members + 1), float)
     measure, slope_of, pressure_stress = VOLUME.measure, VOLUME.slope, pressure_stress_of(VOLUME)
     words = wp.types.vector(length=each, dtype=wp.uint64)
     numbers = wp.types.matrix(shape=(each, CONSTANTS), dtype=wp.float32)

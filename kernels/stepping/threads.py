@@ -86,16 +86,6 @@ def number_in(word: wp.uint64, k: int):
 
 @wp.func_native("""
 #if defined(__CUDA_ARCH__)
-    return __popc(bits);
-#else
-    return __builtin_popcount(bits);
-#endif
-""")
-def bit_count(bits: int) -> int: ...
-
-
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
     return __ffs(bits) - 1;
 #else
     return __builtin_ctz(bits);

@@ -11,7 +11,6 @@ SHARED_BYTES = 48 * 1024
 VECTOR_BYTES = 12
 WARP = 32
 MAX_THREADS = 1024
-MOST_AT_A_TIME = 64
 
 #: Slots that one thread adds up, with their places in bytes, four to a word; its neighbours add up further slots of the
 #: same node.
@@ -60,15 +59,8 @@ class Layout:
         return max(self.parts * self.subtrees, self.tasks if self.parts > 1 else 0)
 
     @property
-    def room(self) -> int:
-        """Leaves that were left out and are done at a time, a thread each."""
-        return min(MOST_AT_A_TIME, self.threads)
-
-    @property
     def fits(self) -> bool:
-        vectors = 2 * self.nodes + self.slot_count + 1
-        # With the list of leaves that were left out, and their forces.
-        needed = VECTOR_BYTES * (vectors + 4 * self.room) + 4 * (self.room + 1 + self.sum_count)
+        needed = VECTOR_BYTES * (2 * self.nodes + self.slot_count + 1) + 4 * self.sum_count
         return needed <= SHARED_BYTES and self.threads <= MAX_THREADS
 
     @property

@@ -24,6 +24,7 @@ from warp_corot.solvers.implicit.multigrid import Multigrid
 from warp_corot.solvers.implicit.multigrid.level import Level, SmoothedLevel
 from warp_corot.solvers.implicit.multigrid.multigrid import MOST_DENSE
 from warp_corot.solvers.implicit.operator import LinearOperator
+from warp_corot.solvers.implicit.preconditioners import Seen
 
 from .divided_mesh import DividedMesh
 from .exchange import ExchangeLists, Places, in_worlds
@@ -38,16 +39,6 @@ Complete = Callable[[wp.array], None]
 
 #: The tags of messages, after those of bodies and their surfaces.
 TAGS = 1000
-
-
-class Seen:
-    """An operator of a part with the values of other ranks' nodes."""
-
-    def __init__(self, operator: LinearOperator, inverse_mass: wp.array, displacements: wp.array):
-        self._operator, self.inverse_mass, self.displacements = operator, inverse_mass, displacements
-
-    def __getattr__(self, name: str) -> object:
-        return getattr(self._operator, name)
 
 
 class HaloLevel(Level):
@@ -170,7 +161,7 @@ class MultigridOfParts(Multigrid):
         inputs = [self.count, self.count, self._numbers, self._everywhere_mass]
         self.levels[0].launch(values.find_free, self.count, inputs, [self._free])
         u = ranks.exchange(k, operator.displacements, copies=True)
-        self._here.update_finest(Seen(operator, self._inverse_mass, u))  # type: ignore[arg-type]
+        self._here.update_finest(Seen(operator, inverse_mass=self._inverse_mass, displacements=u))  # type: ignore[arg-type]
         self._finest.gather_blocks()
 
     def take_in(self, r: wp.array) -> None:

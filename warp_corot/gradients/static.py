@@ -298,20 +298,10 @@ def static_gradient(
             converge.
     """
     names = parameters.checked_names(wrt, parameters.NEEDS)
-    solved = solved_state(
-        body,
-        model=model,
-        gravity=gravity,
-        names=names,
-        precision=precision,
-        adjoint_tolerance=adjoint_tolerance,
-        preconditioner=preconditioner,
-        obstacles=obstacles,
-        contact=contact,
-        tolerance=tolerance,
-        iterations=iterations,
-        load_steps=load_steps,
-    )
+    options: dict[str, Any] = {"gravity": gravity, "adjoint_tolerance": adjoint_tolerance, "tolerance": tolerance}
+    options |= {"iterations": iterations, "load_steps": load_steps, "preconditioner": preconditioner}
+    options |= {"obstacles": obstacles, "contact": contact, "names": names}
+    solved = solved_state(body, precision=precision, model=model, **options)
     dtype = wp.vec3d if precision == FLOAT64 else wp.vec3
     positions = wp.array(solved.positions, dtype=dtype, device=body.device)
     value, derivative = value_and_derivative(objective, positions)

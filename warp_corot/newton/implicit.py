@@ -128,9 +128,7 @@ class TurnedPieces:
     def launch(self, state: newton.State, particles: Particles, dt: float) -> None:
         """Launch the turn in a step of dt [s]; the elements' gathered positions are turned, too."""
         tets, sums, q = self._tetrahedra, self._sums, state.particle_q
-        _, threads, lanes = sums.sizes
-        inputs = [self._first, self._members, particles, q, state.particle_qd, threads, lanes]
-        wp.launch(kernels.sum_motion, sums.shape, inputs, [sums.parts], device=sums.device)
+        sums.launch(kernels.sum_motion, [self._first, self._members, particles, q, state.particle_qd])
         outputs = [self._centres, self._turns, self._any_turns]
         sums.launch_scalars(increments.find_turns, [wp.float64(dt)], outputs)
         inputs = [self._piece, q, self._centres, self._turns, self._entry]

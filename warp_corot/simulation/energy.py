@@ -36,13 +36,13 @@ class Clock:
     def dt(self) -> float:
         """The time step [s]; if none was given, the one that the present state allows."""
         safe_step = self.safe_step
-        return self.pace.dt if safe_step is None else safe_step.allowed
+        return self.pace.dt if safe_step is None else safe_step.control.dt
 
     @property
     def dt_range(self) -> tuple[float, float]:
         """The shortest and the longest time step so far [s]."""
         safe_step = self.safe_step
-        return (self.dt, self.dt) if safe_step is None else safe_step.range
+        return (self.dt, self.dt) if safe_step is None else (safe_step.control.shortest, safe_step.control.longest)
 
     @property
     def steps(self) -> int:

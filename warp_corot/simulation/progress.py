@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -54,23 +53,16 @@ def bar_of(
     Yields:
         A function to be called with the amount that is done.
     """
-    began, shown = time.perf_counter(), wanted and is_shown()
-    bar: Any = None
+    if not (wanted and is_shown()):
+        yield lambda _: None
+        return
+    from tqdm import tqdm
 
-    def update(done: float) -> None:
-        nonlocal bar
-        if bar is None:
-            if not shown or time.perf_counter() - began < SILENT:
-                return
-            from tqdm import tqdm
+    form = "{desc}  {percentage:3.0f} % |{bar}| {n:.4g} of {total:.4g} " + unit + ", {remaining} left"
+    options: dict[str, Any] = {"leave": False, "file": sys.stderr, "bar_format": form, "delay": SILENT}
+    with tqdm(desc=what, total=total, **options) as bar:
 
-            form = "{desc}  {percentage:3.0f} % |{bar}| {n:.4g} of {total:.4g} " + unit + ", {remaining} left"
-            bar = tqdm(desc=what, total=total, leave=False, file=sys.stderr, bar_format=form)
-            bar.start_t = bar.last_print_t = bar.start_t - (time.perf_counter() - began)
-        bar.update(done - bar.n)
+        def update(done: float) -> None:
+            bar.update(done - bar.n)
 
-    try:
         yield update
-    finally:
-        if bar is not None:
-            bar.close()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from copy import copy
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -163,10 +163,8 @@ def checked_obstacles(given: Shape | Sequence[Shape]) -> tuple[Shape, ...]:
 
 
 def rest_on(
-    bodies: Sequence[SoftBody],
+    loaded: Sequence[LoadedBody],
     laws: Sequence[Model],
-    fields: Sequence[ForceField],
-    loads: Sequence[npt.NDArray[np.float64]],
     gravity: tuple[float, float, float],
     obstacles: Sequence[Shape],
     contact: Contact | None,
@@ -181,9 +179,8 @@ def rest_on(
     fail too, the bodies return to their first state.
 
     Args:
-        bodies: The bodies.
-        laws, fields: Their elasticity.
-        loads: Loads and weight of each [N], [worlds * N, 3].
+        loaded: The bodies.
+        laws: Their models.
         gravity: [m/s^2].
         obstacles: The obstacles on which they rest.
         contact: The options of contact.
@@ -191,6 +188,7 @@ def rest_on(
         most: The maximum number of steps.
         preconditioner: The preconditioner of the linear solves.
     """
+    bodies = [each.body for each in loaded]
     starts = [body.displacements.numpy().copy() for body in bodies]
     steps, linear, worlds, rolls, fault = 0, 0, bodies[0].worlds, False, ""
     correction, converged = np.full(worlds, np.inf), np.zeros(worlds, bool)
@@ -211,7 +209,7 @@ def rest_on(
                 steps += 1
                 at_rest = all((each <= np.maximum(tolerance, least)).all() for each, least in corrections)
                 if at_rest and _unfinished(sim) == unfinished:
-                    converged = _residuals(bodies, fields, loads) <= BALANCED
+                    converged = _residuals(loaded) <= BALANCED
                     if converged.all():
                         break
             fault = UNFINISHED if _unfinished(sim) > unfinished else ""
@@ -224,7 +222,7 @@ def rest_on(
         for body, start in zip(bodies, starts, strict=True):
             body.displacements = start
     contact_then = sim.contact if converged.all() else None
-    residual = float(_residuals(bodies, fields, loads).max())
+    residual = float(_residuals(loaded).max())
     return Rest(converged, steps, linear, float(correction.max()), residual, contact_then, rolls, fault)
 
 
@@ -251,12 +249,10 @@ def _correction(body: SoftBody, dt: float) -> tuple[npt.NDArray[np.float64], npt
     return moved / reach, ROUNDING * float(np.abs(body.mesh.points).max()) / reach
 
 
-def _residuals(
-    bodies: Sequence[SoftBody], fields: Sequence[ForceField], loads: Sequence[npt.NDArray[np.float64]]
-) -> npt.NDArray[np.float64]:
+def _residuals(loaded: Sequence[LoadedBody]) -> npt.NDArray[np.float64]:
     """The norm of forces that are out of balance over that of the loads or of contact, whichever is larger, of each
     world and the body where it is largest."""
-    return np.max([_residual(*each) for each in zip(bodies, fields, loads, strict=True)], axis=0)
+    return np.max([_residual(each.body, each.field, each.loads) for each in loaded], axis=0)
 
 
 def _residual(body: SoftBody, field: ForceField, loads: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
@@ -306,18 +302,8 @@ def bring_to_rest(sim: Simulation) -> Rest:
     for each in loaded:
         each.body.state.adopt_positions()
         each.field.relax_fully()
-    found = rest_on(
-        sim.bodies,
-        sim.models,
-        sim.fields,
-        [each.loads for each in loaded],
-        sim.gravity,
-        _standing(sim),
-        sim.contact.options,
-        tolerance=TOLERANCE,
-        most=STEPS,
-        preconditioner=None,
-    )
+    options: dict[str, Any] = {"tolerance": TOLERANCE, "most": STEPS, "preconditioner": None}
+    found = rest_on(loaded, sim.models, sim.gravity, _standing(sim), sim.contact.options, **options)
     for each in loaded:
         each.finish()
     if found.contact is not None:

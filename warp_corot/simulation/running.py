@@ -28,7 +28,7 @@ from warp_corot.solvers.recorded import Segment
 from .progress import bar_of
 
 if TYPE_CHECKING:
-    from warp_corot.solvers.pace import Pace
+    from warp_corot.solvers.pace import Pace, StepControl
 
     from .simulation import Simulation
 
@@ -308,6 +308,11 @@ class Running:
     def _check_steps(self) -> int:
         return self._sim.recorded.interval if self._returns else self._energies.check_steps
 
+    @property
+    def _control(self) -> StepControl:
+        assert self._sim.safe_step is not None
+        return self._sim.safe_step.control
+
     # --- what a run is to be ---------------------------------------------------------------------------------------
 
     def _plan(self, done: int, most: int, end: float | None) -> tuple[list[Segment], int]:
@@ -341,7 +346,7 @@ class Running:
             segments.append(Segment(count, resumes=resumes, measured=measured, fits=stop > 0))
             shortened = stop > 0
             done += count
-            left -= count * sim.safe_step.allowed
+            left -= count * sim.safe_step.control.dt
             sure = max(sure - (phase == 0), 0)
             if done == stop:
                 break
@@ -350,24 +355,22 @@ class Running:
     def _steps_for(self, left: float, before: int) -> float:
         """An estimate of the number of steps in the remaining time [s]; after ``before`` of them the step is measured
         again."""
-        safe = self._sim.safe_step
-        assert safe is not None
         if math.isinf(left):
             return math.inf
-        allowed = safe.allowed
-        expected = allowed * (SHRINKING if allowed < SHRINKING * safe.at_rest else 1.0)
+        control = self._control
+        allowed = control.dt
+        expected = allowed * (SHRINKING if allowed < SHRINKING * control.at_rest else 1.0)
         steps = _steps(left, allowed)
         return steps if steps <= before else before + _steps(left - before * allowed, expected)
 
     def _sure_intervals(self, left: float) -> int:
         """Whole intervals after which some time is left, even if the step grows as fast as it can."""
-        safe = self._sim.safe_step
-        assert safe is not None
         if math.isinf(left):
             return MOST_INTERVALS
-        interval, longest = self._sim.recorded.interval, safe.at_rest
+        control = self._control
+        interval, longest = self._sim.recorded.interval, control.at_rest
         growth = float(GROWTH)
-        dt = min(growth * safe.allowed, longest)
+        dt = min(growth * control.dt, longest)
         count = 0
         left -= 2 * interval * dt
         while count < MOST_INTERVALS and left >= interval * dt:
@@ -378,10 +381,7 @@ class Running:
 
     def _may_have_grown(self) -> bool:
         """Whether steps may have become much longer since the device's last report, so that fewer are enough."""
-        safe = self._sim.safe_step
-        assert safe is not None
-        share, allowed, at_rest = safe.shares
-        return share * allowed < GROWN * at_rest
+        return self._control.dt < GROWN * self._control.at_rest
 
     # --- after a run -----------------------------------------------------------------------------------------------
 

@@ -116,24 +116,12 @@ def solve_static(
         InputError: An argument has another type or is out of its range, the model does not support the mesh or the
             precision, or all its nodes are held.
     """
-    report, _ = static_answer(
-        body,
-        model=model,
-        gravity=gravity,
-        tolerance=tolerance,
-        iterations=iterations,
-        load_steps=load_steps,
-        preconditioner=preconditioner,
-        obstacles=obstacles,
-        contact=contact,
-        precision=precision,
-    )
-    return report
+    search = (tolerance, iterations, load_steps, preconditioner)
+    return static_answer(body, model, gravity, *search, obstacles, contact, precision)[0]
 
 
 def static_answer(
     body: SoftBody,
-    *,
     model: Model | None,
     gravity: npt.ArrayLike | None,
     tolerance: float = 1e-6,
@@ -170,7 +158,7 @@ def static_answer(
         if steps != 1:
             raise InputError(f"load_steps is {steps}; with obstacles or contact it must be 1")
         options: dict[str, Any] = {"tolerance": tolerance, "most": most, "preconditioner": preconditioner}
-        rest = rest_on([body], [law], [forces], [answer.loads], down, things, contact, **options)
+        rest = rest_on([answer], [law], down, things, contact, **options)
         return answer.resting(rest), rest.contact
     if answer.falls():
         return answer.report(
@@ -186,16 +174,13 @@ def static_answer(
     converged = found.converged
     if precision == FLOAT64 and converged.all():
         return _precise(answer, law, solver), None
-    report = answer.report(
-        "the body is at rest" if converged.all() else _what_stopped(answer, solver, status_words(found), converged),
-        iterations=solver.iterations,
-        linear_iterations=solver.linear_iterations,
-        residual=float(found.residual.max()),
-        correction=float(found.correction.max()),
-        load_share=solver.share,
-        world_converged=converged,
-    )
-    return report, None
+    known: dict[str, Any] = {"iterations": solver.iterations, "linear_iterations": solver.linear_iterations}
+    known |= {"residual": float(found.residual.max()), "correction": float(found.correction.max())}
+    known |= {"load_share": solver.share, "world_converged": converged}
+    why = "the body is at rest"
+    if not converged.all():
+        why = _what_stopped(answer, solver, status_words(found), converged)
+    return answer.report(why, **known), None
 
 
 def _check_precision(precision: str, body: SoftBody, law: Model, *, touches: bool) -> None:
@@ -253,12 +238,8 @@ class _Answer(LoadedBody):
         body = self.body
         u = body.state.displacements.numpy()[: body.sizes.nodes, :3].astype(np.float64)
         energy = self.field.elastic_energy(body.state.displacements) - float(np.sum(self.loads * u))
-        nothing: dict[str, Any] = {
-            "iterations": 0,
-            "linear_iterations": 0,
-            "residual": math.inf,
-            "correction": math.inf,
-        }
+        nothing: dict[str, Any] = dict.fromkeys(("iterations", "linear_iterations"), 0)
+        nothing |= dict.fromkeys(("residual", "correction"), math.inf)
         known = nothing | {"load_share": 0.0, "world_converged": np.zeros(body.worlds, bool)} | known
         converged, took = bool(known["world_converged"].all()), time.perf_counter() - self._began
         return StaticReport(converged=converged, message=message, energy=energy, time=took, **known)
@@ -266,15 +247,9 @@ class _Answer(LoadedBody):
     def resting(self, found: Rest) -> StaticReport:
         """The report on an answer in contact."""
         self.finish()
-        report = self.report(
-            found.message,
-            iterations=found.iterations,
-            linear_iterations=found.linear_iterations,
-            residual=found.residual,
-            correction=found.correction,
-            load_share=1.0 if found.converged.all() else 0.0,
-            world_converged=found.converged,
-        )
+        known = {name: getattr(found, name) for name in ("iterations", "linear_iterations", "residual", "correction")}
+        known |= {"load_share": float(found.converged.all()), "world_converged": found.converged}
+        report = self.report(found.message, **known)
         return replace(report, contacts=() if found.contact is None else tuple(contact_points(found.contact)))
 
 

@@ -78,11 +78,9 @@ class Balance:
         if self._ranks.is_reproducible:
             # Elements are addends, too.
             count = max(count, *(each.launch_elements for each in sizes))
-        parts = WorldSums(
-            self.worlds, max(count // self.worlds, 1), kernels.COLUMNS, self.device, self._ranks, most=WARPS
-        )
-        self._sums, self._lanes, self._threads = parts.parts, parts.lanes, parts.shape[1]
-        self._addends = wp.zeros_like(self._sums) if self._ranks.is_reproducible else None
+        sizes_of_sums = (self.worlds, max(count // self.worlds, 1), kernels.COLUMNS)
+        self._sums = WorldSums(*sizes_of_sums, self.device, self._ranks, most=WARPS)
+        self._addends = wp.zeros_like(self._sums.parts) if self._ranks.is_reproducible else None
         self._energies: list[wp.array] = [wp.empty(0, dtype=wp.float64, device=self.device) for _ in self.bodies]
         self._field_states: list[dict[str, wp.array]] = [{} for _ in self.bodies]
         self._mapped = Mapped(self.worlds * kernels.COLUMNS + kernels.NUMBERS, self.device)
@@ -140,10 +138,10 @@ class Balance:
         for account in system.accounts if accounts is None else accounts:
             self._add_rows(account, kernels.WORKED)
         if self._addends is not None:
-            wp.copy(self._addends, self._sums)
-        inputs = [self._lanes, system.pace.orders, system.support_work, system.bad_step, copies.changed]
-        inputs += [system.pace.control, system.pace.arrays, self._sums]
-        dim = (self.worlds, kernels.COLUMNS, self._lanes)
+            wp.copy(self._addends, self._sums.parts)
+        inputs = [self._sums.arrays, system.pace.orders, system.support_work, system.bad_step, copies.changed]
+        inputs += [system.pace.control, system.pace.arrays]
+        dim = (self.worlds, kernels.COLUMNS, self._sums.lanes)
         wp.launch(kernels.report, dim, inputs, [self._totals, self._numbers], device=self.device)
 
     def wait(self) -> Energies:
@@ -192,8 +190,7 @@ class Balance:
         self._add_rows(energies.reshape((1, len(energies))), kernels.ELASTIC)
 
     def _add_rows(self, rows: wp.array, column: int) -> None:
-        inputs = [rows, rows.shape[1] // self.worlds, self._threads, self._lanes, column]
-        wp.launch(kernels.sum_rows, (self.worlds, self._threads), inputs, [self._sums], device=self.device)
+        self._sums.launch(kernels.sum_rows, [rows, rows.shape[1] // self.worlds, column])
 
     def _add_nodal(self, k: int, u: wp.array, v: wp.array, pace: Pace, keeps: bool) -> None:
         """Add the sums over the nodes of a body, and keep its state beside the last good one."""
@@ -201,11 +198,10 @@ class Balance:
         pushing, dynamics = system.pushing(k), system.dynamics(body, 0.0)
         dynamics.u, dynamics.v = u, v
         count = body.sizes.launch_nodes // self.worlds
-        inputs = [pace, wp.float64(system.lag), dynamics, body.conditions.mass, count, self._threads, self._lanes]
+        inputs = [pace, wp.float64(system.lag), dynamics, body.conditions.mass, count]
         inputs += [int(pushing is not None), u if pushing is None else pushing]
         inputs += [int(body.state.is_touched), body.state.contact_forces, system.pace.orders, int(keeps)]
-        outputs = [copies.u[k], copies.v[k], self._sums]
-        wp.launch(kernels.sum_nodes, (self.worlds, self._threads), inputs, outputs, device=self.device)
+        self._sums.launch(kernels.sum_nodes, [*inputs, copies.u[k], copies.v[k]])
 
 
 class Copies:

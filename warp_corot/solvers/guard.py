@@ -36,13 +36,6 @@ MOTION = 0.5
 LITTLE = 0.1
 #: The share that is tolerated if the step can be made shorter.
 STRICT = 0.02
-#: The tolerated error of fast vibrations if the step can be made shorter: a shorter step would keep the error.
-RINGING = 0.01
-#: If the simulation chooses the step, energy from nowhere counts for a third after this time [s]: it cannot be undone
-#: by then, and a permanently short step would not make up for it.
-MEMORY = 10.0
-#: Window of time over which its growth is found [s]: crushed elements take energy and give it back.
-WINDOW = 0.1
 #: Factor on what is tolerated if rotations are shared: their forces have no energy.
 SHARED = 4.0
 #: A body at rest that its weight and loads set in motion moves at least this many times the kinetic energy of half the
@@ -90,12 +83,9 @@ class Guard:
         self._good: Known | None = None
         shared = any(getattr(field, "rotation_level", None) is not None for field in system.fields)
         self._leave = SHARED if shared else 1.0
-        #: Energy from nowhere between the last two checks of elastic energies, and lately, as shares of the energy that
-        #: was moved, of the world with the most; and the same for the error of fast vibrations at any one time.
-        #: Infinite until a check has found them.
-        self.gain = self.surplus = self.untimely = np.inf
-        #: Growth of the energy that came lately within the window of time that has just ended; None during a window.
-        self.trend: float | None = None
+        #: Energy from nowhere between the last two checks of elastic energies, and in all, as shares of the energy that
+        #: was moved, of the world with the most; infinite until a check has found it.
+        self.gain = self.surplus = np.inf
         #: Whether a user had written to the state before the last run that was checked.
         self.was_given = False
         self.restart()
@@ -103,14 +93,13 @@ class Guard:
     def restart(self) -> None:
         """Forget everything: the next state counts as good."""
         self._reference = None
-        self._scale, self._drift, self._lately, self._loads = (np.zeros(self.worlds) for _ in range(4))
-        self._counted_at = self._window_at = self.system.pace.time
-        self._lately_before = np.zeros(self.worlds)
-        self._height, self._loads_since = np.zeros(self.worlds), np.zeros(self.worlds)
+        self._scale, self._drift, self._loads, self._height, self._loads_since = (
+            np.zeros(self.worlds) for _ in range(5)
+        )
         self._absolute_base = np.zeros(self.worlds)
         self._counted: Floats | None = None
         self._work = np.zeros(2)
-        self.gain = self.surplus = self.untimely = np.inf
+        self.gain = self.surplus = np.inf
         self._floor: Floats | None = None
 
     def forget(self) -> None:
@@ -226,24 +215,20 @@ class Guard:
     @property
     def state(self) -> dict[str, Floats]:
         """What a run needs besides the present state to continue."""
-        counted = np.full((8, self.worlds), np.nan) if self._counted is None else self._counted
+        counted = np.full((7, self.worlds), np.nan) if self._counted is None else self._counted
         before = self._reference
         if before is not None and not self._has_changed():
             now = self._find(whole=False)
             # The accounts of constraints begin again at zero, the work of supports does not.
             supports = before.supports - now.worked
             counted[:6] = before.exact, before.gravitational, supports, self._loads_since, self._height, self._loads
-            counted[6:] = before.untimely, now.worked_absolute - self._absolute_base
-        times = np.broadcast_to([[self._counted_at], [self._window_at]], (2, self.worlds))
-        lately = np.array([self._lately, self._lately_before, *times])
+            counted[6] = now.worked_absolute - self._absolute_base
         work = np.array(self.system.pace.known.work) if self._counted is None else self._work
-        return {"scale": self._scale, "drift": self._drift, "lately": lately, "counted": counted, "work": work}
+        return {"scale": self._scale, "drift": self._drift, "counted": counted, "work": work}
 
-    def resume(self, *, scale: Floats, drift: Floats, lately: Floats, counted: Floats, work: Floats) -> None:
+    def resume(self, *, scale: Floats, drift: Floats, counted: Floats, work: Floats) -> None:
         """Continue from what ``state`` gave."""
         self._scale, self._drift = np.array(scale, float), np.array(drift, float)
-        self._lately, self._lately_before = np.array(lately[0], float), np.array(lately[1], float)
-        self._counted_at, self._window_at = float(lately[2, 0]), float(lately[3, 0])
         self.system.pace.forget()
         if np.isfinite(counted).all():
             self._counted, self._work = np.array(counted, float), np.array(work, float)
@@ -254,8 +239,8 @@ class Guard:
         """Count from the energies of a given state."""
         if self._counted is not None:
             exact, gravitational, supports, self._loads_since, self._height, self._loads = self._counted[:6]
-            untimely, self._absolute_base = self._counted[6], -self._counted[7]
-            found = replace(found, exact=exact, gravitational=gravitational, supports=supports, untimely=untimely)
+            self._absolute_base = -self._counted[6]
+            found = replace(found, exact=exact, gravitational=gravitational, supports=supports)
         else:
             self._loads, self._height = np.zeros(self.worlds), found.gravitational
             self._loads_since = np.zeros(self.worlds)
@@ -349,8 +334,6 @@ class Guard:
             drift = np.maximum(self._drift + found.exact - given, 0.0)
             gain = np.maximum(np.maximum(gain, found.exact - given), drift)
             bad |= ~(found.exact - given <= GAIN * leave * scale + floor)
-            if leave < self._leave:
-                bad |= ~(found.untimely <= RINGING * self._leave * scale + floor)
             if not lenient:
                 bad |= ~(drift <= DRIFT * self._leave * scale + 10.0 * floor)
         if not bad.any():
@@ -376,27 +359,12 @@ class Guard:
             return
         if self._balance.is_closed:
             floor = self._rounding()
-            now = self.system.pace.time
-            left = math.exp(min(self._counted_at - now, 0.0) / MEMORY)
-            self._counted_at = now
             self._drift = np.maximum(self._drift + found.exact - given, 0.0)
-            # At the time of the displacements, since that energy is the same whatever the next step is. What was lost
-            # may come back.
-            more = found.exact + found.untimely - given - before.untimely
-            self._lately = np.where(self._lately > 0.0, left, 1.0) * self._lately + more
             known = 1.0 / np.maximum(self._scale, 1e-200) / self._leave
             self.gain = float(np.max(np.maximum(found.exact - given - floor, 0.0) * known))
-            shares = np.maximum(self._lately - 10.0 * floor, 0.0) * known
-            most = int(np.argmax(shares))
-            self.surplus, self.trend = float(shares[most]), None
-            if not 0.0 <= now - self._window_at < WINDOW:
-                self.trend = float((self._lately - self._lately_before)[most] * known[most])
-                self._window_at, self._lately_before = now, self._lately
-            with np.errstate(over="ignore"):  # a body that flies off is found out by infinity, too
-                self.untimely = float(np.max(np.maximum(found.untimely - floor, 0.0) * known))
+            self.surplus = float(np.max(np.maximum(self._drift - 10.0 * floor, 0.0) * known))
         else:
-            self.gain = self.surplus = self.untimely = 0.0
-            self.trend = None
+            self.gain = self.surplus = 0.0
         self._loads, self._loads_since = self._loads + self._loads_since, np.zeros(self.worlds)
         self._reference = found
 
@@ -414,19 +382,10 @@ QUIET = 0.25
 CALM = 0.95
 FALLING = 0.9
 #: Tolerated energy from nowhere between two checks, as a share of the energy that gravity, loads and supports have
-#: moved; beyond it the step becomes shorter. The more energy came lately, the less is tolerated, down to this share.
-LITTLE_GAIN = 0.001
+#: moved; beyond it the step becomes shorter. The more energy came in all, up to the second share, the less is
+#: tolerated, down to ``LEAST_LEAVE`` times this.
+LITTLE_GAIN, MOST_SURPLUS = 0.001, 0.008
 LEAST_LEAVE = 0.2
-#: The same for the energy that came lately (``MEMORY``). Above the first share, the step becomes shorter while
-#: this energy grows from one window of time to the next, and faster the nearer it is to the second share. Otherwise the
-#: step slowly grows.
-SURPLUS, MOST_SURPLUS = 0.004, 0.008
-LEAST_CUT, MOST_CUT = 0.95, 0.7
-SLOW_RECOVERY = 1.1
-#: The step becomes shorter if the error of fast vibrations is more than this share.
-UNTIMELY = 0.004
-#: The errors of vibrations at different times do not add up, so they alone make the share no smaller than this.
-LEAST_SHARE = 0.3
 #: Growth of the step's share from one measurement to the next: from a half to one in 35 measurements.
 RECOVERY = 1.02
 
@@ -474,36 +433,26 @@ class EnergyControl:
         """
         if self._safe_step is None:
             return
-        guard, share = self._guard, self._safe_step.share
+        guard, share = self._guard, self._safe_step.control.share
         intervals = (steps - self._pace.schedule.steps) / self._recorded.interval
         self._pace.schedule = self._pace.schedule._replace(steps=steps)
-        leave = LITTLE_GAIN * max(1.0 - guard.surplus / MOST_SURPLUS, LEAST_LEAVE)
-        late, more = guard.untimely / UNTIMELY, guard.gain / leave
-        if late > 1.0 or more > 1.0:
-            least = min(share, LEAST_SHARE)
-            share *= max(1.0 / math.sqrt(max(more, 1.0)), 0.5)
-            share = min(share, max(share / math.sqrt(max(late, 1.0)), least))
-        elif guard.surplus <= SURPLUS:
-            share = min(share * RECOVERY**intervals, 1.0)
-        if guard.surplus > SURPLUS and guard.trend is not None:
-            near = min((guard.surplus - SURPLUS) / (MOST_SURPLUS - SURPLUS), 1.0)
-            cut = LEAST_CUT + near * (MOST_CUT - LEAST_CUT)
-            share = min(share * (cut if guard.trend > 0.0 else SLOW_RECOVERY), 1.0)
-        if share != self._safe_step.share:
+        more = guard.gain / (LITTLE_GAIN * max(1.0 - guard.surplus / MOST_SURPLUS, LEAST_LEAVE))
+        share = share * max(1.0 / math.sqrt(more), 0.5) if more > 1.0 else min(share * RECOVERY**intervals, 1.0)
+        if share != self._safe_step.control.share:
             self._take_share(share)
 
     def halve(self, steps: int) -> None:
         """Take half the share, after going back to the state with this number of steps."""
         assert self._safe_step is not None
         self._pace.schedule = self._pace.schedule._replace(steps=steps)
-        self._take_share(0.5 * self._safe_step.share)
+        self._take_share(0.5 * self._safe_step.control.share)
 
     def choose_intervals(self, *, checked: bool) -> None:
         """Check more often if a body is strained, and less often if checks of elastic energies found it calm."""
         if self._safe_step is None:
             return
         guard = self._guard
-        share, allowed, at_rest = self._safe_step.shares
+        allowed, share, at_rest, *_ = self._safe_step.control
         before = self._pace.schedule
         calm = 0
         if not checked or allowed < FALLING * before.allowed:
@@ -513,8 +462,7 @@ class EnergyControl:
         if share < 1.0 or calm == LIVELY:
             intervals = CLOSE_INTERVALS
         elif allowed < STRAINED * at_rest:
-            quiet = max(guard.gain / LITTLE_GAIN, guard.untimely / UNTIMELY) < QUIET
-            intervals = STRAINED_INTERVALS if quiet else CLOSE_INTERVALS
+            intervals = STRAINED_INTERVALS if guard.gain < QUIET * LITTLE_GAIN else CLOSE_INTERVALS
         else:
             intervals = CHECK_INTERVALS if calm > 1 else STRAINED_INTERVALS
         self._choose(calm=calm, intervals=intervals, allowed=allowed)
@@ -528,6 +476,5 @@ class EnergyControl:
     def _take_share(self, share: float) -> None:
         """Set the share of the allowed step from here on."""
         assert self._safe_step is not None
-        self._safe_step.share = max(share, float(LEAST))
-        self._safe_step.resume()
+        self._safe_step.take_share(max(share, float(LEAST)))
         self._guard.settle()

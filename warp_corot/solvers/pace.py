@@ -58,6 +58,27 @@ class Schedule(NamedTuple):
     allowed: float = 0.0
 
 
+class StepControl(NamedTuple):
+    """The numbers that set the length of steps, if none was given [s]; see ``kernels.stepping.pace``.
+
+    Attributes:
+        allowed, share: The step that the state allows, and the share of it that is taken.
+        at_rest: The longest step: that of the bodies at rest.
+        shortest, longest: The shortest and the longest step so far.
+    """
+
+    allowed: float = 0.0
+    share: float = 0.0
+    at_rest: float = 0.0
+    shortest: float = 0.0
+    longest: float = 0.0
+
+    @property
+    def dt(self) -> float:
+        """The step, except where the end of a run shortens it."""
+        return self.share * self.allowed
+
+
 @dataclass(frozen=True)
 class Known:
     """What the host knows of the clock.
@@ -68,7 +89,7 @@ class Known:
 
     counts: tuple[int, int]
     seconds: tuple[float, float, float]
-    control: npt.NDArray[np.float64]
+    control: StepControl
     work: tuple[float, float]
 
 
@@ -110,13 +131,13 @@ class Pace:
             counts, seconds, work = (
                 tuple(array.numpy().tolist()) for array in (self.arrays.counts, self.arrays.seconds, self.support_work)
             )
-            self._known = Known(counts, seconds, self.control.numpy().copy(), work)
+            self._known = Known(counts, seconds, StepControl(*self.control.numpy().tolist()), work)
         return self._known
 
     def saw(self, numbers: npt.NDArray[np.float64]) -> None:
         """Take over the report of ``kernels.stepping.balance.report``."""
         steps, then, dt, time, before, work, absolute = numbers[: int(balance.WORK_ABSOLUTE) + 1].tolist()
-        control = numbers[int(balance.CONTROL) :].copy()
+        control = StepControl(*numbers[int(balance.CONTROL) :].tolist())
         self._known = Known((int(steps), int(then)), (dt, time, before), control, (work, absolute))
 
     def take_given(self) -> None:
@@ -133,14 +154,14 @@ class Pace:
         """Restore an earlier clock."""
         self.arrays.counts.assign(np.array(known.counts, np.int64))
         self.arrays.seconds.assign(np.array(known.seconds))
-        self.control.assign(known.control)
+        self.control.assign(np.array(known.control))
         self.support_work.assign(np.array(known.work))
         self._known = known
 
-    def write_control(self, control: npt.NDArray[np.float64]) -> None:
+    def write_control(self, control: StepControl) -> None:
         """Write ``control``."""
-        self.control.assign(control)
-        self._known = replace(self.known, control=np.array(control))
+        self.control.assign(np.array(control))
+        self._known = replace(self.known, control=control)
 
     def order(self, *, end: float | None, stop: int, slot: int) -> None:
         """Write the orders for the next run, which begins with ``launch_orders``; no other run may be under way.

@@ -17,7 +17,7 @@ from warp_corot.kernels.stepping import stability as kernels
 from warp_corot.mesh.scattered import normal_numbers, padded
 
 from .halo import ALONE, Halo
-from .pace import Pace, Schedule
+from .pace import Pace, Schedule, StepControl
 
 if TYPE_CHECKING:
     from warp_corot.body.soft_body import SoftBody
@@ -305,27 +305,14 @@ class SafeStep:
         self.find_rest(stable)
 
     @property
-    def allowed(self) -> float:
-        """The step, except where the end of a run shortens it [s]."""
-        control = self.pace.known.control
-        return float(control[clock.SHARE] * control[clock.ALLOWED])
-
-    @property
-    def at_rest(self) -> float:
-        """The longest step: that of the bodies at rest [s]."""
-        return float(self.pace.known.control[clock.AT_REST])
-
-    @property
-    def range(self) -> tuple[float, float]:
-        """The shortest and the longest allowed step so far [s]."""
-        control = self.pace.known.control
-        return float(control[clock.SHORTEST]), float(control[clock.LONGEST])
+    def control(self) -> StepControl:
+        """The numbers that set the step."""
+        return self.pace.known.control
 
     @property
     def is_shortened(self) -> bool:
         """Whether the step differs from the allowed one, as at the end of a run."""
-        control = self.pace.known.control
-        return self.pace.dt != max(self.allowed, float(clock.LEAST) * control[clock.AT_REST])
+        return self.pace.dt != max(self.control.dt, float(clock.LEAST) * self.control.at_rest)
 
     def find_rest(self, stable: Sequence[float]) -> None:
         """Set the stable steps of the bodies at rest [s], with which measurements are compared."""
@@ -337,26 +324,22 @@ class SafeStep:
             rows.append([longest, curvature, model.step_safety, model.strained_safety])
         longest = min(row[0] * row[2] for row in rows)
         self._at_rest.assign(np.array(rows))
-        control = self.pace.known.control.copy()
-        before = control[clock.AT_REST]
-        if before > 0.0:
-            control[clock.ALLOWED] *= longest / before
+        control = self.control
+        if control.at_rest > 0.0:
+            control = control._replace(allowed=control.allowed * longest / control.at_rest, at_rest=longest)
         else:
-            control[:] = longest
-            control[clock.SHARE] = 1.0
-        control[clock.AT_REST] = longest
-        self.pace.write_control(control)
-        self.resume()
-        self.pace.take_given()
+            control = StepControl(longest, 1.0, longest, longest, longest)
+        self._begin_from(control)
 
     def restart(self) -> None:
         """Begin again with the step at rest."""
         for gauge in self.gauges:
             gauge.restart()
-        control = self.pace.known.control.copy()
-        control[clock.ALLOWED], control[clock.SHARE] = control[clock.AT_REST], 1.0
-        self.pace.write_control(control)
         self.pace.schedule = Schedule()
+        self._begin_from(self.control._replace(allowed=self.control.at_rest, share=1.0))
+
+    def _begin_from(self, control: StepControl) -> None:
+        self.pace.write_control(control)
         self.resume()
         self.pace.take_given()
 
@@ -389,27 +372,12 @@ class SafeStep:
         inputs = [self.pace.orders, self._control, self.pace.arrays]
         wp.launch(clock.fit_step, dim=1, inputs=inputs, device=self.device)
 
-    @property
-    def share(self) -> float:
-        """The share of the allowed step that is taken after going back."""
-        return float(self.pace.known.control[clock.SHARE])
-
-    @share.setter
-    def share(self, value: float) -> None:
-        control = self.pace.known.control.copy()
-        control[clock.SHARE] = value
-        control[clock.SHORTEST] = min(control[clock.SHORTEST], value * control[clock.ALLOWED])
-        self.pace.write_control(control)
-
-    @property
-    def shares(self) -> tuple[float, float, float]:
-        """``share``, the allowed step and the step at rest [s]."""
-        control = self.pace.known.control
-        return (
-            float(control[clock.SHARE]),
-            float(control[clock.ALLOWED]),
-            float(control[clock.AT_REST]),
-        )
+    def take_share(self, share: float) -> None:
+        """Set the share of the allowed step that is taken from here on."""
+        control = self.control
+        shortest = min(control.shortest, share * control.allowed)
+        self.pace.write_control(control._replace(share=share, shortest=shortest))
+        self.resume()
 
     @property
     def state(self) -> dict[str, wp.array]:

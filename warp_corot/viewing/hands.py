@@ -212,7 +212,7 @@ class BodySprings(Attachments):
         """The explicit step that the springs must bear [s]; those of implicit steps are as stiff."""
         sim = self.sim
         if not sim.system.is_implicit:
-            return sim.dt if sim.safe_step is None else sim.safe_step.at_rest
+            return sim.dt if sim.safe_step is None else sim.safe_step.control.at_rest
         if self._explicit_dt is None:
             k = sim.bodies.index(self.body)
             frequency = largest_frequency(self.body, sim.fields[k].stiffest, sim.ranks, k)

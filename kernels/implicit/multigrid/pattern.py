@@ -49,6 +49,16 @@ def pair_of(key: wp.int64, bits: int):
 
 
 @wp.func
+def place_of(i: int, j: int, starts: wp.array[wp.int32], columns: wp.array[wp.int32]):
+    """The place of an entry in its row, or -1."""
+    p = wp.lower_bound(columns, starts[i], starts[i + 1] + 1, j)
+    # Past the end nothing may be read.
+    if p == starts[i + 1] or columns[wp.min(p, starts[i + 1] - 1)] != j:
+        p = int(-1)
+    return p
+
+
+@wp.func
 def parents(i: int, coarse: int, ends: wp.array[wp.vec2i]):
     """The node itself and -1 if it is among the first ``coarse`` ones; otherwise the ends of its edge."""
     if i < coarse:
@@ -237,16 +247,8 @@ def find_row_starts(
 ):
     """Find the position among ``count`` sorted keys at which each row begins, and at which the last one ends."""
     row = wp.tid()
-    wanted = key_of(row, 0, bits)
-    low = int(0)
-    high = int(count)
-    while low < high:
-        middle = low + (high - low) / 2
-        if keys[middle] < wanted:
-            low = middle + 1
-        else:
-            high = middle
-    starts[row] = low
+    # Warp's function gives no place past the last one that it is given, and does not read that one.
+    starts[row] = wp.lower_bound(keys, 0, count + 1, key_of(row, 0, bits))
 
 
 @wp.kernel(enable_backward=False)
@@ -431,9 +433,9 @@ def add_held_blocks(of: Dilatation) -> wp.Kernel:
             for n in range(4):
                 if n != m:
                     j = rank[nodes[n] - world * count]
-                    for k in range(starts[i], starts[i + 1]):
-                        if columns[k] == j:
-                            wp.atomic_add(blocks, world * entries + k, factor * wp.outer(f[n], f[m]))
+                    k = place_of(i, j, starts, columns)
+                    if k >= 0:
+                        wp.atomic_add(blocks, world * entries + k, factor * wp.outer(f[n], f[m]))
 
     return add_held_blocks
 

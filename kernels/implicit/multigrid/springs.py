@@ -6,6 +6,7 @@ element's ancestor, so there again at most four nodes bear it, and a spring adds
 
 import warp as wp
 
+from .pattern import place_of
 from .values import inverse_block
 
 wp.set_module_options({"enable_backward": False})
@@ -95,9 +96,9 @@ def find_spring_entries(
                 world = nodes[a] / count
                 i = nodes[a] - world * count
                 j = nodes[b] - world * count
-                for p in range(starts[i], starts[i + 1]):
-                    if columns[p] == j:
-                        found = world * entries + p
+                p = place_of(i, j, starts, columns)
+                if p >= 0:
+                    found = world * entries + p
             rows.entries[s, 4 * a + b] = found
 
 

@@ -32,7 +32,7 @@ from warp_corot.kernels.tables.shapes import VOLUME, fingerprint
 from warp_corot.kernels.tables.subtree import HANDEDNESS, LEAVES, POSITIONS
 
 from .cycle import LevelArrays, make_step
-from .pattern import EntrySums, kept_share, key_of
+from .pattern import EntrySums, kept_share, key_of, place_of
 from .values import both_free, finish_entry, inverse_block, other_block
 
 wp.set_module_options({"enable_backward": False})
@@ -431,27 +431,17 @@ def find_middles(
     # In
     coarse: int,
     ends: wp.array[wp.vec2i],
-    upper: wp.array[wp.vec2i],
+    starts: wp.array[wp.int32],
+    columns: wp.array[wp.int32],
     # Out
     middles: wp.array[wp.int32],
 ):
-    """Write each finer node at the pair of its ends among the sorted pairs, where there is one."""
+    """Write each finer node at the entry of its ends, where there is one, in the upper triangle."""
     node = coarse + wp.tid()
     i = wp.min(ends[node][0], ends[node][1])
-    j = wp.max(ends[node][0], ends[node][1])
-    low = int(0)
-    high = int(upper.shape[0])
-    while low < high:
-        middle = low + (high - low) / 2
-        pair = upper[middle]
-        if pair[0] < i or (pair[0] == i and pair[1] < j):
-            low = middle + 1
-        else:
-            high = middle
-    # Past the end nothing may be read.
-    if low < upper.shape[0]:  # noqa: SIM102
-        if upper[low][0] == i and upper[low][1] == j:
-            middles[low] = node
+    p = place_of(i, wp.max(ends[node][0], ends[node][1]), starts, columns)
+    if p >= 0:
+        middles[p] = node
 
 
 @wp.kernel(enable_backward=False)
@@ -488,6 +478,6 @@ def gather_roots(
             total += own_block(arrays, first + i)
             for k in range(midpoint_starts[i], midpoint_starts[i + 1]):
                 total += 0.25 * own_block(arrays, first + midpoints[k])
-        elif middles[u] >= 0:
-            total += 0.25 * own_block(arrays, first + middles[u])
+        elif middles[sums.places[u][0]] >= 0:
+            total += 0.25 * own_block(arrays, first + middles[sums.places[u][0]])
     finish_entry(total, world, u, level, sums, inverses)

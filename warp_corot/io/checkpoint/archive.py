@@ -102,7 +102,7 @@ Remesh = OnlineRemesh | Sequence[OnlineRemesh | None] | None
 
 FORMAT = "warp-corot checkpoint"
 #: The version of checkpoints that is written, and the only one that is read.
-VERSION = 13
+VERSION = 14
 
 
 def save_checkpoint(sim: Simulation, path: str | PathLike[str], *, in_parts: bool = False) -> None:

@@ -28,7 +28,7 @@ from .tangent import TangentOperator
 if TYPE_CHECKING:
     from .block_system import VectorBlocks
     from .conjugate_gradients import ConjugateGradients
-    from .contact_constraints import Contact
+    from .operator import Contact
 
 
 Numbers = npt.NDArray[np.integer]

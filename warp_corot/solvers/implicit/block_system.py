@@ -14,7 +14,7 @@ from .conjugate_gradients import ConjugateGradients
 from .operator import Preconditioner
 
 if TYPE_CHECKING:
-    from .contact_constraints import Contact
+    from .operator import Contact
     from .preconditioners import ChosenSolve
     from .tangent import TangentOperator
 

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import warp as wp
@@ -16,9 +15,9 @@ from warp_corot.kernels.implicit import steps as kernels
 from warp_corot.solvers.halo import ALONE
 
 from .block_system import BlockSystem
-from .contact_constraints import Contact, Hold, Touching
 from .multigrid import Multigrid
 from .newton import Newton
+from .operator import Contact, Hold, Touching
 from .preconditioners import Lagged, preconditioner_of
 from .tangent import TangentOperator, TurnedState
 
@@ -30,21 +29,6 @@ if TYPE_CHECKING:
 
 #: The search for soft surfaces leaves room for this many times what a body that is let go falls in a step.
 FALLS = 0.25
-
-
-@dataclass(frozen=True)
-class StepCounts:
-    """How the solve for a step ended, in each world or in all of them together.
-
-    Attributes:
-        iterations, linear_iterations, status: int32 [worlds] or [1].
-        good: The status of a step that is within the tolerance.
-    """
-
-    iterations: wp.array
-    linear_iterations: wp.array
-    status: wp.array
-    good: int
 
 
 class SharedSteps:
@@ -214,21 +198,21 @@ class BodySteps:
         inputs = [self.body.conditions.inverse_mass, state.displacements, state.velocities, *self._left]
         self._launch(kernels.find_changes, inputs, [self.begins])
 
-    def launch_end(self, offset: int, counts: StepCounts, *, is_last: bool) -> None:
+    def launch_end(self, offset: int, counts: list[Any], *, is_last: bool) -> None:
         """Launch the state after the step, and the count of its iterations.
 
         Args:
             offset: As for ``launch_changes``.
-            counts: How the step's solve ended.
+            counts: How the step's solve ended in each world or in all of them together: iterations, linear iterations
+                and status, int32 [worlds] or [1], and the status of a step that is within the tolerance.
             is_last: Whether this may be the last step of a run, whose reactions a user may read.
         """
-        self._end(offset, counts.status)
+        self._end(offset, counts[2])
         if is_last or not self._can_leave_out_reactions:
             self._find_reactions()
         else:
             wp.capture_if(self._moves, self._find_reactions)
-        inputs = [counts.iterations, counts.linear_iterations, counts.status, counts.good]
-        wp.launch(kernels.count_solves, 1, inputs, [self.shared.totals], device=self.device)
+        wp.launch(kernels.count_solves, 1, counts, [self.shared.totals], device=self.device)
 
     # --- pieces ------------------------------------------------------------------------------------------------------
 
@@ -306,10 +290,8 @@ class BodySteps:
         state, conditions = body.state, body.conditions
         self.field.add_forces(state.displacements, newton.forces)
         self.shared.add_other_forces()
-        inputs = [system.gravity, conditions.mass, conditions.inverse_mass, int(conditions.has_loads)]
-        inputs += [conditions.loads, newton.forces, state.forces, newton.increment]
-        kernel = kernels.COUNT_SUPPORTS[conditions.loads.dtype]
-        self._launch(kernel, inputs, [state.reactions, system.support_work_of(body)])
+        inputs = [system.dynamics(body, 0.0), conditions.mass, newton.forces, newton.increment]
+        self._launch(kernels.count_supports, inputs, [state.reactions, system.support_work_of(body)])
         newton.forces.zero_()
         self.shared.forget_forces()
 

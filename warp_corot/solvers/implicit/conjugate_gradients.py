@@ -12,13 +12,13 @@ import warp as wp
 
 from warp_corot.kernels.implicit import conjugate_gradients as kernels
 from warp_corot.kernels.implicit import line_search as searches
-from warp_corot.kernels.implicit.conjugate_gradients import sum_products
+from warp_corot.kernels.stepping.sums import Sums
 from warp_corot.solvers.halo import ALONE, Halo
 
 from .operator import Preconditioner, Product
 
 if TYPE_CHECKING:
-    from .contact_constraints import SolvedContact
+    from .operator import SolvedContact
 
 #: Number of lanes in a warp, minimum number of nodes of a thread, and maximum number of warps of all worlds.
 WARP, NODES, WARPS = 32, 4, 512
@@ -38,7 +38,8 @@ class WorldSums:
     Attributes:
         parts: Parts of the sums, float64 [worlds, parts, columns].
         shape: The threads of a launch over all nodes [2].
-        sizes: The arguments count, threads and lanes of its kernel.
+        lanes: The threads that compute a part.
+        arrays: The same for kernels.
     """
 
     def __init__(
@@ -53,13 +54,18 @@ class WorldSums:
             warps = count
         threads = warps * self.lanes
         self.parts = wp.zeros((worlds, warps, columns), dtype=wp.float64, device=device)
-        self.shape, self.sizes = (worlds, threads), [count, threads, self.lanes]
+        self.shape, self.arrays = (worlds, threads), Sums()
+        self.arrays.count, self.arrays.threads, self.arrays.lanes = count, threads, self.lanes
+        self.arrays.parts = self.parts
 
     def launch_products(self, a: wp.array, b: wp.array, column: int) -> None:
         """Launch a . b of each world, vec4."""
-        inputs = [a, b, *self.sizes, column]
-        wp.launch(sum_products, self.shape, inputs, [self.parts], device=self.device)
-        self.take_in(column)
+        self.launch(kernels.sum_products, [a, b, column], column)
+
+    def launch(self, kernel: wp.Kernel, arguments: list, *columns: int) -> None:
+        """Launch a kernel that finds the parts of sums in these columns."""
+        wp.launch(kernel, self.shape, [self.arrays, *arguments], device=self.device)
+        self.take_in(*columns)
 
     def take_in(self, *columns: int, most: bool = False) -> None:
         """Launch the replacement of columns of new parts by those of all ranks.
@@ -68,13 +74,13 @@ class WorldSums:
             columns: The numbers of the columns.
             most: Whether their largest parts are asked for, not their sums.
         """
-        if not self._ranks.is_alone:
+        if columns and not self._ranks.is_alone:
             take_in(self.parts, list(columns), self._ranks, most=most)
 
     def launch_scalars(self, kernel: wp.Kernel, inputs: list, outputs: list) -> None:
         """Launch a kernel that adds the parts up, with the lanes of a warp for each world."""
         dim = (self.worlds, self.lanes)
-        wp.launch(kernel, dim, [self.parts, self.lanes, *inputs], outputs, device=self.device)
+        wp.launch(kernel, dim, [self.arrays, *inputs], outputs, device=self.device)
 
 
 def take_in(parts: wp.array, columns: list[int], ranks: Halo, *, most: bool = False) -> None:
@@ -174,12 +180,10 @@ class ConjugateGradients:
         r, q, sums = self.r, self._q, self._sums
         if guessed:
             self.operator.apply(x, q)
-            wp.launch(kernels.measure_guess, sums.shape, [b, x, q, *sums.sizes], [sums.parts], device=self.device)
-            sums.take_in(int(kernels.PRODUCT), int(kernels.CURVATURE))
+            sums.launch(kernels.measure_guess, [b, x, q], int(kernels.PRODUCT), int(kernels.CURVATURE))
             sums.launch_scalars(kernels.take_guess, [], [self.scalars])
-        inputs = [b, b if like is None else like, q, self.scalars, int(guessed), *sums.sizes, x]
-        wp.launch(kernels.begin, sums.shape, inputs, [r, sums.parts], device=self.device)
-        sums.take_in(int(kernels.SQUARE), int(kernels.RIGHT))
+        arguments = [b, b if like is None else like, q, self.scalars, int(guessed), x, r]
+        sums.launch(kernels.begin, arguments, int(kernels.SQUARE), int(kernels.RIGHT))
         self._running.zero_()
         outputs = [self.scalars, self.iterations, self.status, self._running]
         sums.launch_scalars(kernels.take_first, [self.tolerance, wp.float64(share)], outputs)
@@ -198,9 +202,7 @@ class ConjugateGradients:
         sums.launch_products(p, q, int(kernels.CURVATURE))
         outputs = [self.scalars, self.iterations, self.status, self._running]
         sums.launch_scalars(kernels.take_alpha, [], outputs)
-        inputs = [p, q, self.scalars, *sums.sizes, x, r]
-        wp.launch(kernels.advance, sums.shape, inputs, [sums.parts], device=self.device)
-        sums.take_in(int(kernels.SQUARE))
+        sums.launch(kernels.advance, [p, q, self.scalars, x, r], int(kernels.SQUARE))
         outputs = [self.scalars, self.status, self._running]
         sums.launch_scalars(kernels.judge, [self.most, self.iterations], outputs)
 
@@ -266,10 +268,8 @@ class LineSearch:
         """
         self._power.launch_products(change, rest, 0)
         self._loss.launch_products(change, product, 0)
-        lanes = self._power.lanes
-        inputs = [self._power.parts, self._loss.parts, lanes]
         outputs = [self._search, self._slopes, self._searching]
-        wp.launch(searches.begin_search, (self._worlds, lanes), inputs, outputs, device=self.device)
+        self._power.launch_scalars(searches.begin_search, [self._loss.arrays], outputs)
         wp.capture_while(self._searching, self._try, d=d, change=change)
         for increase, grown in ((change, d), (product, image)):
             if grown is not None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -11,7 +11,8 @@ import warp as wp
 
 from warp_corot.kernels.implicit import newton as kernels
 from warp_corot.kernels.implicit.increments import move_held
-from warp_corot.kernels.implicit.residual import FIND_RESIDUAL
+from warp_corot.kernels.implicit.residual import find_residual
+from warp_corot.solvers.system import dynamics_of
 
 from .block_system import BlockSystem
 from .conjugate_gradients import WorldSums
@@ -135,9 +136,8 @@ class Newton:
         self.linearise()
         self.system.update()
         self.system.solve()
-        inputs = [self.body.conditions.mass, self.residual, self._outer, self.step, u, *sums.sizes]
-        wp.launch(kernels.measure_step, sums.shape, inputs, [sums.parts], device=self.device)
-        sums.take_in(int(kernels.SLOPE), int(kernels.OUTER), int(kernels.INERTIA))
+        inputs = [self.body.conditions.mass, self.residual, self._outer, self.step, u]
+        sums.launch(kernels.measure_step, inputs, int(kernels.SLOPE), int(kernels.OUTER), int(kernels.INERTIA))
         sums.take_in(int(kernels.STEP), int(kernels.REACH), most=True)
         self._searching.zero_()
         self._accepted.zero_()
@@ -159,12 +159,9 @@ class Newton:
         self.ranks.owned(self.body).clear_ghosts(self.forces)
         if self._others is not None:
             self._others()
-        inputs: list[Any] = [self.gravity, conditions.mass, conditions.inverse_mass, int(conditions.has_loads)]
-        inputs += [conditions.loads, self.external_share, self.inertia, self.pull, self.increment, *sums.sizes]
-        outputs = [self.forces, body.state.forces, self.residual, self._outer, sums.parts]
-        kernel = FIND_RESIDUAL[conditions.loads.dtype]
-        wp.launch(kernel, sums.shape, inputs, outputs, device=self.device)
-        sums.take_in(int(kernels.SQUARE), int(kernels.REFERENCE))
+        inputs = [dynamics_of(body, self.gravity, 0.0), conditions.mass, self.external_share, self.inertia, self.pull]
+        inputs += [self.increment, self.forces, self.residual, self._outer]
+        sums.launch(find_residual, inputs, int(kernels.SQUARE), int(kernels.REFERENCE))
 
     def linearise(self) -> None:
         """Launch the linearisation at the present displacements, or at ``turned``; the residual must be known."""
@@ -181,10 +178,8 @@ class Newton:
         self._energies.zero_()
         self.field.write_potentials(self.body.state.displacements, self._energies)
         self.ranks.owned(self.body).clear_copies(self._energies)
-        sums = self._sums
-        inputs = [self._energies, len(self._energies) // self.worlds, *sums.sizes[1:]]
-        wp.launch(kernels.sum_energies, sums.shape, inputs, [sums.parts], device=self.device)
-        sums.take_in(int(kernels.ENERGY))
+        inputs = [self._energies, len(self._energies) // self.worlds]
+        self._sums.launch(kernels.sum_energies, inputs, int(kernels.ENERGY))
 
     def _try_step(self, *, commits: bool) -> None:
         inputs = [self._scalars, self.base, self.step, self._count, int(commits)]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import warp as wp
 
@@ -46,29 +46,12 @@ class BlockDiagonal:
         wp.launch(kernel, count, inputs, outputs, device=self.device)
 
 
-class CostlySetUp(Preconditioner, Protocol):
-    """A preconditioner whose set-up costs as much as many iterations.
+class Seen:
+    """An operator with some of its arrays replaced."""
 
-    Attributes:
-        revision: Changes whenever its launches do, so that they must be recorded again.
-    """
-
-    revision: int
-
-    def update(self, operator: LinearOperator) -> None: ...
-
-    def apply(self, r: wp.array, z: wp.array) -> None: ...
-
-    def follow(self) -> bool:
-        """Follow the mesh; returns whether launches have changed."""
-        ...
-
-
-class At:
-    """An operator at other displacements."""
-
-    def __init__(self, operator: LinearOperator, displacements: wp.array):
-        self._operator, self.displacements = operator, displacements
+    def __init__(self, operator: LinearOperator, **arrays: wp.array):
+        self._operator = operator
+        vars(self).update(arrays)
 
     def __getattr__(self, name: str) -> object:
         return getattr(self._operator, name)
@@ -86,7 +69,7 @@ class Lagged:
         state: Arrays by name to be kept with the state of the body, so that a resumed run is the same.
     """
 
-    def __init__(self, preconditioner: CostlySetUp, operator: LinearOperator, ranks: Halo = ALONE):
+    def __init__(self, preconditioner: Multigrid, operator: LinearOperator, ranks: Halo = ALONE):
         self._ranks = ranks
         self.preconditioner, self._operator, self.device = preconditioner, operator, operator.device
         self._counts = wp.zeros(kernels.COUNTS, dtype=wp.int32, device=self.device)
@@ -96,7 +79,7 @@ class Lagged:
         length = len(operator.inverse_mass)
         self._kept = wp.zeros(length, dtype=wp.vec4, device=self.device)
         self._held = wp.zeros(length, dtype=wp.uint8, device=self.device)
-        self._then = At(operator, self._kept)
+        self._then = Seen(operator, displacements=self._kept)
 
     @property
     def state(self) -> dict[str, wp.array]:
@@ -124,13 +107,11 @@ class Lagged:
 
     def follow_springs(self, springs: Springs) -> None:
         """Make room for springs; not while launches are recorded, and after ``prepare``."""
-        if hasattr(self.preconditioner, "follow_springs"):
-            self.preconditioner.follow_springs(springs)
+        self.preconditioner.follow_springs(springs)
 
     def take_springs(self) -> None:
         """Launch the exchange of the springs in the preconditioner for the present ones."""
-        if hasattr(self.preconditioner, "take_springs"):
-            self.preconditioner.take_springs()
+        self.preconditioner.take_springs()
 
     def apply(self, r: wp.array, z: wp.array) -> None:
         self.preconditioner.apply(r, z)

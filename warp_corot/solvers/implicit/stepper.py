@@ -16,7 +16,7 @@ from warp_corot.solvers.system import Stepper
 
 from .assembled import AssembledSolve, suits
 from .block_system import BlockSystem, VectorBlocks
-from .body_steps import BodySteps, SharedSteps, StepCounts
+from .body_steps import BodySteps, SharedSteps
 from .contact_solve import ContactSolve
 from .preconditioners import ChosenSolve, Lagged
 
@@ -266,15 +266,14 @@ class StepSolve:
         newtons = [body.newton for body in bodies]
         self._linearised: LinearisedStep | None = None
         if self._touches or options.tolerance is None:
-            self._linearised = LinearisedStep(
+            solve = self._linearised = LinearisedStep(
                 self._system, newtons, tolerance=options.tolerance, most=options.iterations
             )
-            solve, good = self._linearised, int(conjugate_gradients.CONVERGED)
-            self._counts = StepCounts(solve.iterations, solve.linear_iterations, solve.status, good)
+            good = int(conjugate_gradients.CONVERGED)
+            self._counts = [solve.iterations, solve.linear_iterations, solve.status, good]
         else:
             (newton,) = newtons
-            good = int(kernels_of_newton.CONVERGED)
-            self._counts = StepCounts(newton.iterations, newton.solved, newton.status, good)
+            self._counts = [newton.iterations, newton.solved, newton.status, int(kernels_of_newton.CONVERGED)]
 
     def launch(self, offset: int, *, is_last: bool) -> None:
         """Launch the ``offset``-th step since the clock was last advanced; ``is_last`` as for ``BodySteps``."""
@@ -304,4 +303,4 @@ class StepSolve:
             wp.capture_while(newton.running, newton.launch_iteration)
             return
         self._linearised.launch(offset)
-        self._system.judge(self._counts.linear_iterations, self._counts.status)
+        self._system.judge(*self._counts[1:3])

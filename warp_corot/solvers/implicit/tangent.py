@@ -158,8 +158,7 @@ class TurnedState:
         state, conditions = body.state, body.conditions
         self._any_turns.zero_()
         inputs = [conditions.mass, conditions.inverse_mass, state.rest, state.displacements, state.velocities]
-        wp.launch(kernels.sum_motion, sums.shape, [*inputs, *sums.sizes], [sums.parts], device=operator.device)
-        sums.take_in(*range(kernels.MOTION_COLUMNS))
+        sums.launch(kernels.sum_motion, inputs, *range(kernels.MOTION_COLUMNS))
         outputs = [self._centres, self._turns, self._any_turns]
         sums.launch_scalars(kernels.find_turns, [self._dt], outputs)
         inputs = [operator.node_count, state.rest, state.displacements, self._centres, self._turns]

@@ -120,9 +120,9 @@ class PatternFinder:
 
     def middles(self, pattern: Pattern, fine: int) -> wp.array:
         """The node of the next finer level, of ``fine`` nodes, between the nodes of each entry in the upper triangle;
-        -1: none; int32."""
-        found = wp.full(len(pattern.sums.upper), -1, dtype=wp.int32, device=self.device)
-        inputs = [pattern.count, self.ends, pattern.sums.upper]
+        -1: none; int32 [entries]."""
+        found = wp.full(pattern.entries, -1, dtype=wp.int32, device=self.device)
+        inputs = [pattern.count, self.ends, pattern.starts, pattern.columns]
         self._launch(roots_kernels.find_middles, fine - pattern.count, inputs, [found])
         return found
 
