@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from remesh_cases import random_marks
+from remesh_cases import counts_of, random_marks
 from remeshed import SOFT
 from tree_levels import TreeLevels
 from volumes import blobs
@@ -74,7 +74,7 @@ def remesh(body, rng, passes):
     for _ in range(passes):
         body.changing.passes.apply(random_marks(body.changing.forest, rng, 0.05, 0.3))
         body.changing.renew()
-        counts = body.changing.forest.counts()
+        counts = counts_of(body.changing.forest)
         added, removed = added + counts.added, removed + counts.removed
     assert not body.changing.is_full
     return added, removed

@@ -3,11 +3,10 @@
 import numpy as np
 import pytest
 import warp as wp
-from remesh_cases import CUBE, random_marks
+from remesh_cases import CUBE, RemeshPass, random_marks
 from shortened import crossed
 
 import warp_corot as wc
-from warp_corot.discretization.changing.passes import RemeshPass
 from warp_corot.discretization.changing.plan import DevicePlan, launch_size
 from warp_corot.discretization.changing.pools import DeviceForest
 from warp_corot.discretization.elements import device_elements

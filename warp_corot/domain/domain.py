@@ -19,8 +19,6 @@ if TYPE_CHECKING:
     from .surface import Surface
 
 
-@forwards("kind", "has_pieces", "holds", "exits", "points_in", "label_volumes")
-@forwards("kind", "_phi", "_labels", "_thickness", "_details")
 class Domain(SignedFunction):
     """A body as a signed function phi [m], negative inside.
 
@@ -36,44 +34,29 @@ class Domain(SignedFunction):
         device: The device that evaluates points given as NumPy arrays.
     """
 
-    def __init__(self, kind: SignedFunction):
-        options: dict[str, Any] = {"up_axis": kind.up_axis, "label_names": kind.label_names, "device": kind.device}
-        super().__init__(kind.bounds, kind.lipschitz, **options)
-        self._kind = kind
-
-    def __getattr__(self, name: str) -> Any:
-        """Attributes of one kind only, such as ``numbers`` and ``affine`` of voxels and ``closed`` of a surface."""
-        if name.startswith("_"):
-            raise AttributeError(f"{type(self).__name__!r} has no attribute {name!r}")
-        return getattr(self._kind, name)
-
-    @property
-    def kind(self) -> SignedFunction:
-        return self._kind
-
     def part(self, name: str) -> Domain:
         """The domain of a single label.
 
         Raises:
             InputError: The domain has no label of this name; the message lists its labels.
         """
-        return Domain(self._kind.part(name))
+        return _Made(super().part(name))
 
     def named(self, name: str) -> Domain:
         """The same body, with one label of that name everywhere.
 
         In a union, the label of the first domain that holds a point counts: ``tumour.named("tumour") | liver``.
         """
-        return Domain(NamedDomain(self, name))
+        return _Made(NamedDomain(self, name))
 
     def __or__(self, other: Domain) -> Domain:
-        return Domain(UnionDomain(self, other)) if isinstance(other, Domain) else NotImplemented
+        return _Made(UnionDomain(self, other)) if isinstance(other, Domain) else NotImplemented
 
     def __and__(self, other: Domain) -> Domain:
-        return Domain(IntersectionDomain(self, other)) if isinstance(other, Domain) else NotImplemented
+        return _Made(IntersectionDomain(self, other)) if isinstance(other, Domain) else NotImplemented
 
     def __sub__(self, other: Domain) -> Domain:
-        return Domain(DifferenceDomain(self, other)) if isinstance(other, Domain) else NotImplemented
+        return _Made(DifferenceDomain(self, other)) if isinstance(other, Domain) else NotImplemented
 
     # Ways to make one.
 
@@ -113,7 +96,7 @@ class Domain(SignedFunction):
         """
         from .surface import surface_domain
 
-        return cls(surface_domain(surface, unit, up_axis, device))
+        return _Made(surface_domain(surface, unit, up_axis, device))
 
     @classmethod
     def from_labels(
@@ -160,7 +143,7 @@ class Domain(SignedFunction):
         """
         from .labels import label_domain
 
-        return cls(label_domain(volume, labels, (spacing, origin, affine, unit), smoothing, up_axis, device))
+        return _Made(label_domain(volume, labels, (spacing, origin, affine, unit), smoothing, up_axis, device))
 
     @classmethod
     def from_probabilities(
@@ -189,7 +172,7 @@ class Domain(SignedFunction):
         """
         from .labels import probability_domain
 
-        return cls(probability_domain(maps, certain, (spacing, origin, affine, unit), smoothing, up_axis, device))
+        return _Made(probability_domain(maps, certain, (spacing, origin, affine, unit), smoothing, up_axis, device))
 
     @classmethod
     def from_function(
@@ -215,26 +198,50 @@ class Domain(SignedFunction):
             InputError: The box is empty, the function has another form, is not finite in the box, or changes faster
                 than ``lipschitz`` says.
         """
-        return cls(FunctionDomain(function, bounds, lipschitz, up_axis=up_axis, device=device))
+        return _Made(FunctionDomain(function, bounds, lipschitz, up_axis=up_axis, device=device))
 
     @classmethod
     def sphere(cls, radius: float, centre: Sequence[float] = (0.0, 0.0, 0.0), **options: Any) -> Domain:
         """A ball [m]. Options here and below: ``up_axis``, ``device``."""
-        return cls(shapes.sphere(radius, centre, **options))
+        return _Made(shapes.sphere(radius, centre, **options))
 
     @classmethod
     def box(cls, lower: Sequence[float], upper: Sequence[float], **options: Any) -> Domain:
         """An axis-aligned box between two corners [m]."""
-        return cls(shapes.box(lower, upper, **options))
+        return _Made(shapes.box(lower, upper, **options))
 
     @classmethod
     def torus(
         cls, major: float, minor: float, centre: Sequence[float] = (0.0, 0.0, 0.0), axis: str = "Z", **options: Any
     ) -> Domain:
         """A ring: a tube of radius ``minor`` around a circle of radius ``major`` [m] about an axis."""
-        return cls(shapes.torus(major, minor, centre, axis, **options))
+        return _Made(shapes.torus(major, minor, centre, axis, **options))
 
     @classmethod
     def capsule(cls, start: Sequence[float], end: Sequence[float], radius: float, **options: Any) -> Domain:
         """All points within ``radius`` of the segment between two points [m]."""
-        return cls(shapes.capsule(start, end, radius, **options))
+        return _Made(shapes.capsule(start, end, radius, **options))
+
+
+@forwards("kind", "has_pieces", "holds", "exits", "points_in", "label_volumes")
+@forwards("kind", "_phi", "_labels", "_thickness", "_details")
+class _Made(Domain):
+    """A signed function of any kind, as a user holds it."""
+
+    def __init__(self, kind: SignedFunction):
+        options: dict[str, Any] = {"up_axis": kind.up_axis, "label_names": kind.label_names, "device": kind.device}
+        super().__init__(kind.bounds, kind.lipschitz, **options)
+        self._kind = kind
+
+    def __getattr__(self, name: str) -> Any:
+        """Attributes of one kind only, such as ``numbers`` and ``affine`` of voxels and ``closed`` of a surface."""
+        if name.startswith("_"):
+            raise AttributeError(f"{type(self).__name__!r} has no attribute {name!r}")
+        return getattr(self._kind, name)
+
+    @property
+    def kind(self) -> SignedFunction:
+        return self._kind
+
+    def part(self, name: str) -> Domain:
+        return _Made(self._kind.part(name))

@@ -150,29 +150,6 @@ class RemeshPass:
         self._demand = wp.zeros(1, dtype=wp.int64, device=self.device)
         self._goes_on = wp.zeros(1, dtype=wp.int32, device=self.device)
         self._sums, self._ends = (wp.zeros(forest.threads, dtype=wp.int32, device=self.device) for _ in range(2))
-        self._graphs: dict[bool, wp.Graph] = {}
-
-    def run(self) -> None:
-        """Mark the leaves by the criterion and change the mesh. The first call records the launches; others replay."""
-        self._replay(marked=False)
-
-    def apply(self, marks: npt.ArrayLike) -> None:
-        """Change the mesh by marks instead of the criterion.
-
-        Args:
-            marks: 1 for leaves to bisect, -1 for leaves that may be merged, 0 for the others, [T].
-
-        Raises:
-            InputError: The marks have other values or another number.
-        """
-        given = np.asarray(marks)
-        count = self.forest.leaf_count
-        if given.shape != (count,) or not np.isin(given, (-1, 0, 1)).all():
-            raise InputError(f"marks must be -1, 0 or 1 for each of {count} leaves")
-        whole = np.zeros(len(self.forest.pools.marks), np.int8)
-        whole[:count] = given
-        self.forest.pools.marks.assign(whole)
-        self._replay(marked=True)
 
     def launch(self, *, marked: bool = False, goes_on: bool = False) -> None:
         """Launch a pass, or record it within the caller's capture.
@@ -227,16 +204,6 @@ class RemeshPass:
         self._once(order.lower_top, pools)
         self._many(order.move_nodes, pools, self.forest.carriage.arrays, moves)
         self._many(order.rename_ends, moves, pools)
-
-    def _replay(self, *, marked: bool) -> None:
-        if self.device.is_cuda and not wp.is_conditional_graph_supported():
-            self.launch(marked=marked)
-            return
-        if marked not in self._graphs:
-            with wp.ScopedCapture(device=self.device) as capture:
-                self.launch(marked=marked)
-            self._graphs[marked] = capture.graph
-        wp.capture_launch(self._graphs[marked])
 
     def _once(self, kernel: wp.Kernel, *arguments: Any) -> None:
         wp.launch(kernel, dim=1, inputs=list(arguments), device=self.device)

@@ -38,7 +38,7 @@ class Carriage:
 
     A new node is the midpoint of its deformed edge, so that children have their parent's deformation gradient. Mass is
     lumped, a quarter of each leaf's at its nodes, and carries its momentum along; momentum that a held node cannot take
-    up is counted in ``support_impulse``. A node between two held ones is held. Loads stay where they are; half of a
+    up is counted in ``arrays.impulse``. A node between two held ones is held. Loads stay where they are; half of a
     removed node's load goes to each end of its edge. Children have their parent's density and values; a parent has its
     children's mean, or the value by the rule of its ``Column``.
 
@@ -117,11 +117,6 @@ class Carriage:
     def values(self, name: str) -> npt.NDArray[np.float32]:
         """A quantity at all places for tetrahedra; only the values of leaves count."""
         return self.arrays.values.numpy()[:, self.names.index(name)]
-
-    @property
-    def support_impulse(self) -> npt.NDArray[np.float64]:
-        """Impulse of the supports in all passes, as mass came to and left held nodes [N s], float64 [3]."""
-        return self.arrays.impulse.numpy()[0]
 
     def update_inverse_mass(self) -> None:
         """Find the inverse masses again, which are zero where nodes are held."""
