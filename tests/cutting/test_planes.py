@@ -8,7 +8,7 @@ from remesh_cases import RemeshPass, counts_of, is_full, momentum, moving, rando
 from remeshed import bar, near, twin
 
 import warp_corot as wc
-from warp_corot.discretization.changing.cutting import CutPass, plane_surface
+from warp_corot.discretization.changing.passes import CutPass, plane_surface
 from warp_corot.kernels.remesh.cut_surface import Surface
 
 STEPS = wc.SymplecticEuler(dt=2e-4, damping=1.0)

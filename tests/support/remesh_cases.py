@@ -20,6 +20,19 @@ DENSITY = 1000.0
 PAIRS = list(itertools.combinations(range(4), 2))
 
 
+def set_marks(forest, marks):
+    """1 for leaves to bisect, -1 for leaves that may be merged, 0 for the others, [T]."""
+    whole = np.zeros(len(forest.pools.marks), np.int8)
+    whole[: forest.leaf_count] = marks
+    forest.pools.marks.assign(whole)
+
+
+def apply_marks(remesh, marks):
+    """Change a mesh by a pass with these marks instead of the criterion."""
+    set_marks(remesh.forest, marks)
+    remesh.launch(marked=True)
+
+
 class RemeshPass(passes.RemeshPass):
     """Passes that are recorded once and replayed, by the criterion or by marks."""
 
@@ -27,10 +40,7 @@ class RemeshPass(passes.RemeshPass):
         self._replay(marked=False)
 
     def apply(self, marks):
-        """Change the mesh by marks: 1 for leaves to bisect, -1 for leaves that may be merged, 0 for the others, [T]."""
-        whole = np.zeros(len(self.forest.pools.marks), np.int8)
-        whole[: self.forest.leaf_count] = marks
-        self.forest.pools.marks.assign(whole)
+        set_marks(self.forest, marks)
         self._replay(marked=True)
 
     def _replay(self, *, marked):
