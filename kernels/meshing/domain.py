@@ -20,19 +20,6 @@ MOST_PASSED = wp.constant(8)
 PASSED = wp.constant(1.0e-4)
 
 
-@unique_kernel()
-def evaluate_sphere(
-    # In
-    points: wp.array[wp.vec3],
-    centre: wp.vec3,
-    radius: float,
-    # Out
-    phi: wp.array[wp.float32],
-):
-    i = wp.tid()
-    phi[i] = wp.length(points[i] - centre) - radius
-
-
 @wp.func
 def box_distance(p: wp.vec3, lower: wp.vec3, upper: wp.vec3):
     """Signed distance to an axis-aligned box."""
@@ -40,50 +27,35 @@ def box_distance(p: wp.vec3, lower: wp.vec3, upper: wp.vec3):
     return wp.length(wp.max(beyond, wp.vec3(0.0))) + wp.min(wp.max(beyond), 0.0)
 
 
-@unique_kernel()
-def evaluate_box(
-    # In
-    points: wp.array[wp.vec3],
-    lower: wp.vec3,
-    upper: wp.vec3,
-    # Out
-    phi: wp.array[wp.float32],
-):
-    i = wp.tid()
-    phi[i] = box_distance(points[i], lower, upper)
+#: Kinds of shapes: between two corners; around a centre and an axis; around a segment, which is a point for a ball.
+BOX = wp.constant(0)
+TORUS = wp.constant(1)
+CAPSULE = wp.constant(2)
 
 
 @unique_kernel()
-def evaluate_torus(
+def evaluate_shape(
     # In
     points: wp.array[wp.vec3],
-    centre: wp.vec3,
-    axis: wp.vec3,
+    kind: int,
+    a: wp.vec3,
+    b: wp.vec3,
     major: float,
     minor: float,
     # Out
     phi: wp.array[wp.float32],
 ):
     i = wp.tid()
-    p = points[i] - centre
-    height = wp.dot(p, axis)
-    phi[i] = wp.length(wp.vec2(wp.length(p - height * axis) - major, height)) - minor
-
-
-@unique_kernel()
-def evaluate_capsule(
-    # In
-    points: wp.array[wp.vec3],
-    start: wp.vec3,
-    end: wp.vec3,
-    radius: float,
-    # Out
-    phi: wp.array[wp.float32],
-):
-    i = wp.tid()
-    p = points[i] - start
-    along = end - start
-    phi[i] = wp.length(p - along * wp.clamp(wp.dot(p, along) / wp.dot(along, along), 0.0, 1.0)) - radius
+    p = points[i] - a
+    if kind == BOX:
+        phi[i] = box_distance(points[i], a, b)
+    elif kind == TORUS:
+        height = wp.dot(p, b)
+        phi[i] = wp.length(wp.vec2(wp.length(p - height * b) - major, height)) - minor
+    else:
+        along = b - a
+        share = wp.dot(p, along) / wp.max(wp.dot(along, along), 1.0e-37)
+        phi[i] = wp.length(p - along * wp.clamp(share, 0.0, 1.0)) - minor
 
 
 @unique_kernel()

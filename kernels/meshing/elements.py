@@ -7,7 +7,7 @@ import warp as wp
 
 from warp_corot.kernels.tables.shapes import FIRST_NODE, SECOND_NODE
 
-from .growth import VOID
+from .growth import VOID, Forest
 
 wp.set_module_options({"enable_backward": False})
 
@@ -26,65 +26,62 @@ FLATTEST = wp.constant(0.1)
 vec6 = wp.types.vector(length=6, dtype=wp.float32)
 
 
+@wp.func
+def lattice_place(p: wp.vec3i, forest: Forest):
+    """Where a lattice point is [m]."""
+    return forest.origin + forest.spacing * wp.vec3d(wp.float64(p[0]), wp.float64(p[1]), wp.float64(p[2]))
+
+
 @wp.kernel(enable_backward=False)
 def node_points(
     # In
-    lattice: wp.array[wp.vec3i],
     first: int,
-    origin: wp.vec3d,
-    spacing: wp.float64,
+    forest: Forest,
     # Out
     points: wp.array[wp.vec3],
 ):
     """Positions in float64, with a single rounding."""
     i = wp.tid()
-    p = lattice[first + i]
-    points[i] = wp.vec3(
-        float(origin[0] + wp.float64(p[0]) * spacing),
-        float(origin[1] + wp.float64(p[1]) * spacing),
-        float(origin[2] + wp.float64(p[2]) * spacing),
-    )
+    x = lattice_place(forest.lattice[first + i], forest)
+    points[i] = wp.vec3(float(x[0]), float(x[1]), float(x[2]))
 
 
 @wp.kernel(enable_backward=False)
 def take_values(
     # In
     found: wp.array[wp.float32],
-    lattice: wp.array[wp.vec3i],
     first: int,
     top: wp.vec3i,
     noise: float,
-    # Out
-    phi: wp.array[wp.float32],
+    # In and out
+    forest: Forest,
 ):
     """Values of new nodes: the outermost faces of the grid are outside, and rounding noise counts as zero."""
     i = wp.tid()
-    p = lattice[first + i]
+    p = forest.lattice[first + i]
     value = found[i]
     if wp.abs(value) <= noise:
         value = 0.0
     if wp.min(p) == 0 or p[0] == top[0] or p[1] == top[1] or p[2] == top[2]:
         value = wp.max(value, 0.0)
-    phi[first + i] = value
+    forest.phi[first + i] = value
+
+
+@wp.func
+def values_at(tet: wp.vec4i, forest: Forest):
+    return wp.vec4(forest.phi[tet[0]], forest.phi[tet[1]], forest.phi[tet[2]], forest.phi[tet[3]])
 
 
 @wp.kernel(enable_backward=False)
 def judge_by_corners(
     # In
     first: int,
-    tets: wp.array[wp.vec4i],
-    level: wp.array[wp.int32],
-    phi: wp.array[wp.float32],
-    circumradius: wp.array[wp.float32],
-    edges: wp.array2d[wp.float32],
-    lipschitz: float,
     min_level: int,
     max_level: int,
     # In and out
-    first_child: wp.array[wp.int32],
+    forest: Forest,
     # Out
     states: wp.array[wp.int32],
-    needs: wp.array[wp.float32],
 ):
     """Elements have no surface if values exceed the function's possible change over the distance from them.
 
@@ -93,19 +90,19 @@ def judge_by_corners(
     levels below, which have half the size. Values at midpoints are bounded by those at the ends.
     """
     i = wp.tid()
-    tet = tets[first + i]
-    own_level = level[first + i]
-    p = wp.vec4(phi[tet[0]], phi[tet[1]], phi[tet[2]], phi[tet[3]])
-    near = lipschitz * circumradius[own_level]
+    own_level = forest.level[first + i]
+    p = values_at(forest.tets[first + i], forest)
+    lipschitz = forest.lipschitz
+    near = lipschitz * forest.circumradius[own_level]
     lowest = wp.min(p)
     highest = wp.max(p)
     longest = float(0.0)
     for e in range(6):
-        longest = wp.max(longest, edges[own_level, e])
+        longest = wp.max(longest, forest.edges[own_level, e])
     outside = lowest > near or highest > lipschitz * longest
     inside = highest < -near or lowest < -lipschitz * longest
     for e in range(6):
-        change = 0.5 * lipschitz * edges[own_level, e]
+        change = 0.5 * lipschitz * forest.edges[own_level, e]
         a = p[FIRST_NODE[e]]
         b = p[SECOND_NODE[e]]
         lowest = wp.min(lowest, wp.max(a, b) - change)
@@ -113,32 +110,31 @@ def judge_by_corners(
     state = DONE
     need = float(0.0)
     if outside or lowest > 0.5 * near:
-        first_child[first + i] = VOID
+        forest.first_child[first + i] = VOID
     elif own_level < min_level:
         state = SPLIT
         need = MUST
     elif own_level < max_level and not (inside or highest < -0.5 * near):
         state = OPEN
     states[i] = state
-    needs[first + i] = need
+    forest.need[first + i] = need
 
 
 @wp.func
-def gradient_size(
-    tet: wp.vec4i, phi: wp.array[wp.float32], lattice: wp.array[wp.vec3i], spacing: float, lipschitz: float
-):
+def gradient_size(tet: wp.vec4i, forest: Forest):
     """Length of the interpolant's gradient, bounded from below by a fraction of the steepest one."""
-    p = lattice[tet[0]]
+    p = forest.lattice[tet[0]]
+    spacing = float(forest.spacing)
     rows = wp.mat33()
     rise = wp.vec3()
     for n in range(3):
-        q = lattice[tet[n + 1]]
+        q = forest.lattice[tet[n + 1]]
         rows[n] = spacing * wp.vec3(float(q[0] - p[0]), float(q[1] - p[1]), float(q[2] - p[2]))
-        rise[n] = phi[tet[n + 1]] - phi[tet[0]]
+        rise[n] = forest.phi[tet[n + 1]] - forest.phi[tet[0]]
     # Scaled, so that determinants do not underflow in float32.
     size = wp.length(rows[0])
     gradient = wp.inverse(rows / size) * rise / size
-    return wp.max(wp.length(gradient), FLATTEST * lipschitz)
+    return wp.max(wp.length(gradient), FLATTEST * forest.lipschitz)
 
 
 @wp.func
@@ -163,15 +159,15 @@ def worst_deviation(deviation: vec6):
 
 
 @wp.func
-def middle_of_piece(tet: wp.vec4i, phi: wp.array[wp.float32]):
+def middle_of_piece(phi: wp.vec4):
     """Barycentric coordinates of the mean of the points where the surface cuts the edges of a crossed element."""
     place = wp.vec4(0.0)
     count = float(0.0)
     for e in range(6):
         a = FIRST_NODE[e]
         b = SECOND_NODE[e]
-        if (phi[tet[a]] < 0.0) != (phi[tet[b]] < 0.0):
-            t = phi[tet[a]] / (phi[tet[a]] - phi[tet[b]])
+        if (phi[a] < 0.0) != (phi[b] < 0.0):
+            t = phi[a] / (phi[a] - phi[b])
             place[a] = place[a] + 1.0 - t
             place[b] = place[b] + t
             count += 1.0
@@ -181,24 +177,13 @@ def middle_of_piece(tet: wp.vec4i, phi: wp.array[wp.float32]):
 @wp.kernel(enable_backward=False)
 def judge_by_edges(
     # In
+    begin: int,
     elements: wp.array[wp.int32],
     first: int,
     slots: wp.array[wp.int32],
-    values: wp.array[wp.int32],
-    tets: wp.array[wp.vec4i],
-    level: wp.array[wp.int32],
-    phi: wp.array[wp.float32],
-    lattice: wp.array[wp.vec3i],
-    origin: wp.vec3d,
-    spacing: wp.float64,
-    circumradius: wp.array[wp.float32],
-    lipschitz: float,
-    tolerances: wp.array[wp.float32],
-    closest: wp.array[wp.float32],
     # In and out
-    first_child: wp.array[wp.int32],
+    forest: Forest,
     states: wp.array[wp.int32],
-    needs: wp.array[wp.float32],
     # Out
     unsure: wp.array[wp.int32],
     probes: wp.array[wp.vec3],
@@ -209,37 +194,37 @@ def judge_by_edges(
 
     An element that would barely pass the finest tolerance is unsure and is evaluated once more, in the middle of
     its piece of the surface or at its centroid; ``expected`` is the quadratic function's value there. An element's
-    need is the error of its piece of the surface [m].
+    need is the error of its piece of the surface [m]. ``begin`` is the first thread's place in ``elements``.
     """
-    i = wp.tid()
+    i = begin + wp.tid()
     element = elements[i]
-    tet = tets[element]
-    tolerance = tolerances[level[element]]
-    least = closest[level[element]]
+    tet = forest.tets[element]
+    own_level = forest.level[element]
+    tolerance = forest.tolerances[own_level]
+    least = forest.closest[own_level]
+    radius = forest.circumradius[own_level]
+    phi = values_at(tet, forest)
     deviation = vec6()
-    lowest = phi[tet[0]]
-    highest = phi[tet[0]]
-    for n in range(1, 4):
-        lowest = wp.min(lowest, phi[tet[n]])
-        highest = wp.max(highest, phi[tet[n]])
+    lowest = wp.min(phi)
+    highest = wp.max(phi)
     crossed = lowest < 0.0 and highest >= 0.0
     for e in range(6):
-        middle = phi[values[slots[6 * i + e]]]
+        middle = forest.phi[forest.values[slots[6 * i + e]]]
         lowest = wp.min(lowest, middle)
         highest = wp.max(highest, middle)
-        deviation[e] = middle - 0.5 * (phi[tet[FIRST_NODE[e]]] + phi[tet[SECOND_NODE[e]]])
+        deviation[e] = middle - 0.5 * (phi[FIRST_NODE[e]] + phi[SECOND_NODE[e]])
     worst = worst_deviation(deviation)
 
     state = OPEN
     need = float(0.0)
-    near = 0.5 * lipschitz * circumradius[level[element]]
+    near = 0.5 * forest.lipschitz * radius
     if lowest > near:
-        first_child[element] = VOID
+        forest.first_child[element] = VOID
         state = DONE
     elif highest < -near:
         state = DONE
     elif crossed:
-        slope = gradient_size(tet, phi, lattice, float(spacing), lipschitz)
+        slope = gradient_size(tet, forest)
         tolerance *= slope
         least *= slope
         need = worst / slope
@@ -252,21 +237,18 @@ def judge_by_edges(
     if state == OPEN and (worst > least or worst < 0.25 * least or wp.max(lowest, -highest) > 4.0 * worst):
         state = DONE
     states[element - first] = state
-    needs[element] = wp.min(need, circumradius[level[element]])
+    forest.need[element] = wp.min(need, radius)
     unsure[i] = wp.where(state == OPEN, 1, 0)
 
     place = wp.vec4(0.25)
     if crossed:
-        place = middle_of_piece(tet, phi)
-    value = float(0.0)
+        place = middle_of_piece(phi)
+    value = wp.dot(place, phi)
     for e in range(6):
         value += 4.0 * place[FIRST_NODE[e]] * place[SECOND_NODE[e]] * deviation[e]
-    at = origin
+    at = wp.vec3d()
     for n in range(4):
-        p = lattice[tet[n]]
-        value += place[n] * phi[tet[n]]
-        weight = wp.float64(place[n]) * spacing
-        at += wp.vec3d(wp.float64(p[0]) * weight, wp.float64(p[1]) * weight, wp.float64(p[2]) * weight)
+        at += wp.float64(place[n]) * lattice_place(forest.lattice[tet[n]], forest)
     probes[i] = wp.vec3(float(at[0]), float(at[1]), float(at[2]))
     expected[i] = value
     deviations[i] = worst
@@ -281,39 +263,33 @@ def judge_by_probes(
     found: wp.array[wp.float32],
     expected: wp.array[wp.float32],
     deviations: wp.array[wp.float32],
-    tets: wp.array[wp.vec4i],
-    level: wp.array[wp.int32],
-    phi: wp.array[wp.float32],
-    lattice: wp.array[wp.vec3i],
-    spacing: float,
-    lipschitz: float,
-    tolerances: wp.array[wp.float32],
+    # In and out
+    forest: Forest,
     # Out
     states: wp.array[wp.int32],
-    needs: wp.array[wp.float32],
 ):
     """The last evaluation. Where the function is not the quadratic one of its ten values, for example at a crease, it
     deviates more between the samples than at them: by half as much again where three faces meet."""
     i = wp.tid()
     element = elements[chosen[i]]
-    tet = tets[element]
+    tet = forest.tets[element]
     inside = int(0)
     for n in range(4):
-        if phi[tet[n]] < 0.0:
+        if forest.phi[tet[n]] < 0.0:
             inside += 1
     surprise = wp.abs(found[i] - expected[chosen[i]])
     deviation = deviations[chosen[i]]
     if surprise > 0.1 * deviation:
         deviation = 1.5 * deviation + surprise
     state = DONE
-    need = needs[element]
+    need = forest.need[element]
     if inside > 0 and inside < 4:
-        need = deviation / gradient_size(tet, phi, lattice, spacing, lipschitz)
+        need = deviation / gradient_size(tet, forest)
     elif (found[i] < 0.0) != (inside == 4):
         need = wp.max(wp.abs(found[i]), deviation)
     elif wp.abs(found[i]) <= 2.0 * deviation:
         need = deviation
-    if need > tolerances[level[element]]:
+    if need > forest.tolerances[forest.level[element]]:
         state = SPLIT
     states[element - first] = state
-    needs[element] = need
+    forest.need[element] = need

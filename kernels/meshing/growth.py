@@ -22,6 +22,38 @@ NODES = wp.constant(0)
 DEEPEST = wp.constant(1)  # the deepest level that had to be bisected
 
 
+@wp.struct
+class Forest:
+    """A forest that grows; its arrays have spare room."""
+
+    # Tetrahedra.
+    tets: wp.array[wp.vec4i]
+    level: wp.array[wp.int32]
+    parent: wp.array[wp.int32]
+    first_child: wp.array[wp.int32]  # LIVE or VOID if there is none
+    wished: wp.array[wp.uint8]  # whether it must be bisected
+    bound: wp.array[wp.uint8]  # void, but conforming with its neighbours
+    need: wp.array[wp.float32]  # its error if it is not bisected [m]
+    # Lattice points.
+    lattice: wp.array[wp.vec3i]
+    ends: wp.array[wp.vec2i]  # of the edge whose midpoint it is, -1 for corners of cubes
+    active: wp.array[wp.uint8]
+    touched: wp.array[wp.uint8]  # whether an edge here got an active midpoint
+    phi: wp.array[wp.float32]  # the body's signed function [m]
+    counts: wp.array[wp.int32]
+    # The table from edges to their midpoints.
+    keys: wp.array[wp.int64]
+    values: wp.array[wp.int32]
+    # The body, and what is allowed by level.
+    origin: wp.vec3d  # of the lattice [m]
+    spacing: wp.float64  # of its points [m]
+    lipschitz: float
+    circumradius: wp.array[wp.float32]  # [m]
+    edges: wp.array2d[wp.float32]  # lengths of edges [m]
+    tolerances: wp.array[wp.float32]  # the largest error [m]
+    closest: wp.array[wp.float32]  # the value to which it may be lowered later [m]
+
+
 @wp.func
 def edge_key(a: int, b: int):
     return (wp.int64(wp.min(a, b)) << wp.int64(32)) | wp.int64(wp.max(a, b))
@@ -47,15 +79,6 @@ def find_slot(a: int, b: int, keys: wp.array[wp.int64]):
 
 
 @wp.func
-def find_midpoint(a: int, b: int, keys: wp.array[wp.int64], values: wp.array[wp.int32]):
-    """The node at the middle of an edge, -1 if there is none."""
-    slot = find_slot(a, b, keys)
-    if slot >= 0:
-        return values[slot]
-    return -1
-
-
-@wp.func
 def claim_slot(key: wp.int64, keys: wp.array[wp.int64]):
     """The key's slot; if it was inserted now, its negative minus 1."""
     mask = keys.shape[0] - 1
@@ -72,18 +95,15 @@ def claim_slot(key: wp.int64, keys: wp.array[wp.int64]):
 
 @wp.kernel(enable_backward=False)
 def fill_table(
-    # In
-    ends: wp.array[wp.vec2i],
-    # Out
-    keys: wp.array[wp.int64],
-    values: wp.array[wp.int32],
+    # In and out
+    forest: Forest,
 ):
     """Enter all existing midpoints into an empty table."""
     node = wp.tid()
-    pair = ends[node]
+    pair = forest.ends[node]
     if pair[0] >= 0:
-        slot = claim_slot(edge_key(pair[0], pair[1]), keys)
-        values[-slot - 1] = node
+        slot = claim_slot(edge_key(pair[0], pair[1]), forest.keys)
+        forest.values[-slot - 1] = node
 
 
 @wp.kernel(enable_backward=False)
@@ -91,11 +111,7 @@ def insert_midpoints(
     # In
     pairs: wp.array[wp.vec2i],
     # In and out
-    lattice: wp.array[wp.vec3i],
-    ends: wp.array[wp.vec2i],
-    keys: wp.array[wp.int64],
-    values: wp.array[wp.int32],
-    counts: wp.array[wp.int32],
+    forest: Forest,
     # Out
     slots: wp.array[wp.int32],
 ):
@@ -103,13 +119,13 @@ def insert_midpoints(
     i = wp.tid()
     a = pairs[i][0]
     b = pairs[i][1]
-    slot = claim_slot(edge_key(a, b), keys)
+    slot = claim_slot(edge_key(a, b), forest.keys)
     if slot < 0:
         slot = -slot - 1
-        node = wp.atomic_add(counts, NODES, 1)
-        values[slot] = node
-        ends[node] = wp.vec2i(wp.min(a, b), wp.max(a, b))
-        lattice[node] = halfway(lattice[a], lattice[b])
+        node = wp.atomic_add(forest.counts, NODES, 1)
+        forest.values[slot] = node
+        forest.ends[node] = wp.vec2i(wp.min(a, b), wp.max(a, b))
+        forest.lattice[node] = halfway(forest.lattice[a], forest.lattice[b])
     slots[i] = slot
 
 
@@ -117,17 +133,15 @@ def insert_midpoints(
 def refinement_edges(
     # In
     elements: wp.array[wp.int32],
-    tets: wp.array[wp.vec4i],
-    level: wp.array[wp.int32],
     # In and out
-    counts: wp.array[wp.int32],
+    forest: Forest,
     # Out
     pairs: wp.array[wp.vec2i],
 ):
     i = wp.tid()
-    tet = tets[elements[i]]
-    depth = level[elements[i]]
-    wp.atomic_max(counts, DEEPEST, depth)
+    tet = forest.tets[elements[i]]
+    depth = forest.level[elements[i]]
+    wp.atomic_max(forest.counts, DEEPEST, depth)
     pairs[i] = wp.vec2i(tet[0], tet[refinement_end(depth)])
 
 
@@ -135,13 +149,13 @@ def refinement_edges(
 def all_edges(
     # In
     elements: wp.array[wp.int32],
-    tets: wp.array[wp.vec4i],
+    forest: Forest,
     # Out
     pairs: wp.array[wp.vec2i],
 ):
     """The six edges of each element, in the order of ``tables.shapes.EDGES``."""
     i = wp.tid()
-    tet = tets[elements[i]]
+    tet = forest.tets[elements[i]]
     for e in range(6):
         pairs[6 * i + e] = wp.vec2i(tet[FIRST_NODE[e]], tet[SECOND_NODE[e]])
 
@@ -150,17 +164,14 @@ def all_edges(
 def activate(
     # In
     slots: wp.array[wp.int32],
-    values: wp.array[wp.int32],
-    ends: wp.array[wp.vec2i],
-    # Out
-    active: wp.array[wp.uint8],
-    touched: wp.array[wp.uint8],
+    # In and out
+    forest: Forest,
 ):
     """Make midpoints active, and mark both ends of their edges as touched."""
-    node = values[slots[wp.tid()]]
-    active[node] = wp.uint8(1)
-    touched[ends[node][0]] = wp.uint8(1)
-    touched[ends[node][1]] = wp.uint8(1)
+    node = forest.values[slots[wp.tid()]]
+    forest.active[node] = wp.uint8(1)
+    forest.touched[forest.ends[node][0]] = wp.uint8(1)
+    forest.touched[forest.ends[node][1]] = wp.uint8(1)
 
 
 @wp.kernel(enable_backward=False)
@@ -168,67 +179,59 @@ def bisect(
     # In
     elements: wp.array[wp.int32],
     slots: wp.array[wp.int32],
-    values: wp.array[wp.int32],
     base: int,
     # In and out
-    tets: wp.array[wp.vec4i],
-    level: wp.array[wp.int32],
-    parent: wp.array[wp.int32],
-    first_child: wp.array[wp.int32],
-    bound: wp.array[wp.uint8],
+    forest: Forest,
 ):
     """Bisect elements. Children are stored consecutively from ``base`` on and are live or void like their parent."""
     i = wp.tid()
     element = elements[i]
-    tet = tets[element]
-    z = values[slots[i]]
+    tet = forest.tets[element]
+    depth = forest.level[element]
+    z = forest.values[slots[i]]
     child = base + 2 * i
-    tets[child] = first_half(tet, z, level[element])
-    tets[child + 1] = second_half(tet, z, level[element])
+    forest.tets[child] = first_half(tet, z, depth)
+    forest.tets[child + 1] = second_half(tet, z, depth)
     for n in range(2):
-        level[child + n] = level[element] + 1
-        parent[child + n] = element
-        first_child[child + n] = first_child[element]
-        bound[child + n] = bound[element]
-    first_child[element] = child
+        forest.level[child + n] = depth + 1
+        forest.parent[child + n] = element
+        forest.first_child[child + n] = forest.first_child[element]
+        forest.bound[child + n] = forest.bound[element]
+    forest.first_child[element] = child
 
 
 @wp.kernel(enable_backward=False)
 def flag_hanging(
     # In
-    tets: wp.array[wp.vec4i],
-    first_child: wp.array[wp.int32],
-    wished: wp.array[wp.uint8],
-    bound: wp.array[wp.uint8],
-    keys: wp.array[wp.int64],
-    values: wp.array[wp.int32],
-    active: wp.array[wp.uint8],
-    touched: wp.array[wp.uint8],
+    first: int,
     first_new: int,
+    forest: Forest,
     # Out
     flags: wp.array[wp.int32],
 ):
     """Flag leaves that must be bisected or have an active midpoint on an edge; void ones only if conformity requires.
 
-    Only elements from ``first_new`` on, and those with a recently bisected edge, both ends of which are
-    touched, need a closer check.
+    Only elements from ``first_new`` on, and those with a recently bisected edge, both ends of which are touched, need a
+    closer check. ``first`` is the number of the first thread's element.
     """
-    i = wp.tid()
+    i = first + wp.tid()
     flag = int(0)
-    if first_child[i] == LIVE or (first_child[i] == VOID and bound[i] != wp.uint8(0)):
-        if wished[i] != wp.uint8(0):
+    if forest.first_child[i] == LIVE or (forest.first_child[i] == VOID and forest.bound[i] != wp.uint8(0)):
+        if forest.wished[i] != wp.uint8(0):
             flag = 1
         else:
-            tet = tets[i]
-            ends = int(touched[tet[0]]) + int(touched[tet[1]]) + int(touched[tet[2]]) + int(touched[tet[3]])
+            tet = forest.tets[i]
+            ends = int(0)
+            for n in range(4):
+                ends += int(forest.touched[tet[n]])
             if i >= first_new or ends > 1:
                 for e in range(6):
                     a = tet[FIRST_NODE[e]]
                     b = tet[SECOND_NODE[e]]
-                    if flag == 0 and (i >= first_new or int(touched[a]) * int(touched[b]) == 1):
-                        node = find_midpoint(a, b, keys, values)
-                        if node >= 0:
-                            flag = int(active[node])
+                    if flag == 0 and (i >= first_new or int(forest.touched[a]) * int(forest.touched[b]) == 1):
+                        slot = find_slot(a, b, forest.keys)
+                        if slot >= 0:
+                            flag = int(forest.active[forest.values[slot]])
     flags[i] = flag
 
 

@@ -37,6 +37,26 @@ class Moves:
     forward: wp.array[wp.int32]  # new numbers of movers by their old ones
 
 
+@wp.func
+def walk_nodes(t: int, threads: int, first_hole: int, first_mover: int, writes: bool, pools: Pools, moves: Moves):
+    """The places after the holes and movers in a thread's stretch, which begin at these; lists them if asked."""
+    hole = int(first_hole)
+    mover = int(first_mover)
+    if pools.counts[REMOVED] > 0:
+        top = pools.counts[NODE_TOP] - pools.counts[REMOVED]
+        stretch = (pools.counts[NODE_TOP] + threads - 1) / threads
+        for i in range(t * stretch, wp.min((t + 1) * stretch, pools.counts[NODE_TOP])):
+            if i < top and pools.valence[i] == 0:
+                if writes:
+                    moves.holes[hole] = i
+                hole += 1
+            elif i >= top and pools.valence[i] > 0:
+                if writes:
+                    moves.movers[mover] = i
+                mover += 1
+    return hole, mover
+
+
 @wp.kernel(enable_backward=False)
 def count_moves(
     # In
@@ -46,17 +66,7 @@ def count_moves(
     moves: Moves,
 ):
     t = wp.tid()
-    holes = int(0)
-    movers = int(0)
-    if pools.counts[REMOVED] > 0:
-        top = pools.counts[NODE_TOP] - pools.counts[REMOVED]
-        stretch = (pools.counts[NODE_TOP] + threads - 1) / threads
-        for i in range(t * stretch, wp.min((t + 1) * stretch, pools.counts[NODE_TOP])):
-            if i < top:
-                if pools.valence[i] == 0:
-                    holes += 1
-            elif pools.valence[i] > 0:
-                movers += 1
+    holes, movers = walk_nodes(t, threads, 0, 0, False, pools, moves)
     moves.sums[t] = holes
     moves.sums[threads + t] = movers
 
@@ -70,21 +80,9 @@ def list_moves(
     moves: Moves,
 ):
     t = wp.tid()
-    if pools.counts[REMOVED] > 0:
-        hole = int(0)
-        if t > 0:
-            hole = moves.ends[t - 1]
-        mover = moves.ends[threads + t - 1] - moves.ends[threads - 1]
-        top = pools.counts[NODE_TOP] - pools.counts[REMOVED]
-        stretch = (pools.counts[NODE_TOP] + threads - 1) / threads
-        for i in range(t * stretch, wp.min((t + 1) * stretch, pools.counts[NODE_TOP])):
-            if i < top:
-                if pools.valence[i] == 0:
-                    moves.holes[hole] = i
-                    hole += 1
-            elif pools.valence[i] > 0:
-                moves.movers[mover] = i
-                mover += 1
+    hole = moves.ends[t] - moves.sums[t]
+    mover = moves.ends[threads + t] - moves.sums[threads + t] - moves.ends[threads - 1]
+    walk_nodes(t, threads, hole, mover, True, pools, moves)
 
 
 @wp.kernel(enable_backward=False)
@@ -232,6 +230,24 @@ def first_leaf(i: int, pools: Pools):
     return found
 
 
+@wp.func
+def walk_leaves(t: int, threads: int, first: int, writes: bool, pools: Pools):
+    """The place after the leaves from a thread's stretch, which begin at this one; lists them if asked. Nothing if no
+    leaf has changed."""
+    place = int(first)
+    if pools.counts[ADDED] + pools.counts[REMOVED] > 0:
+        stretch = (pools.counts[LEAVES] + threads - 1) / threads
+        for i in range(t * stretch, wp.min((t + 1) * stretch, pools.counts[LEAVES])):
+            leaf = first_leaf(i, pools)
+            top = wp.where(pools.level[pools.leaves[i]] == UNUSED, leaf, pools.leaves[i])
+            while leaf >= 0:
+                if writes:
+                    pools.new_leaves[place] = leaf
+                place += 1
+                leaf = next_leaf(leaf, top, pools)
+    return place
+
+
 @wp.kernel(enable_backward=False)
 def count_leaves(
     # In
@@ -240,21 +256,7 @@ def count_leaves(
     # Out
     sums: wp.array[wp.int32],
 ):
-    """The number of leaves from each thread's stretch; nothing if no leaf has changed."""
-    t = wp.tid()
-    total = int(0)
-    if pools.counts[ADDED] + pools.counts[REMOVED] > 0:
-        stretch = (pools.counts[LEAVES] + threads - 1) / threads
-        for i in range(t * stretch, wp.min((t + 1) * stretch, pools.counts[LEAVES])):
-            top = pools.leaves[i]
-            leaf = first_leaf(i, pools)
-            if leaf >= 0 and (leaf == top or pools.level[top] == UNUSED):
-                total += 1
-            else:
-                while leaf >= 0:
-                    total += 1
-                    leaf = next_leaf(leaf, top, pools)
-    sums[t] = total
+    sums[wp.tid()] = walk_leaves(wp.tid(), threads, 0, False, pools)
 
 
 @wp.kernel(enable_backward=False)
@@ -262,29 +264,15 @@ def list_leaves(
     # In
     threads: int,
     sums: wp.array[wp.int32],
+    ends: wp.array[wp.int32],
     # In and out
     pools: Pools,
 ):
-    """Write the new list; ``sums`` are inclusive."""
+    """Write the new list; ``ends`` are inclusive sums."""
     t = wp.tid()
-    if pools.counts[ADDED] + pools.counts[REMOVED] > 0:
-        place = int(0)
-        if t > 0:
-            place = sums[t - 1]
-        stretch = (pools.counts[LEAVES] + threads - 1) / threads
-        for i in range(t * stretch, wp.min((t + 1) * stretch, pools.counts[LEAVES])):
-            top = pools.leaves[i]
-            leaf = first_leaf(i, pools)
-            if leaf >= 0 and (leaf == top or pools.level[top] == UNUSED):
-                pools.new_leaves[place] = leaf
-                place += 1
-            else:
-                while leaf >= 0:
-                    pools.new_leaves[place] = leaf
-                    place += 1
-                    leaf = next_leaf(leaf, top, pools)
-        if t == threads - 1:
-            pools.counts[NEW_LEAVES] = place
+    place = walk_leaves(t, threads, ends[t] - sums[t], True, pools)
+    if t == threads - 1:
+        pools.counts[NEW_LEAVES] = place
 
 
 @wp.kernel(enable_backward=False)

@@ -4,12 +4,11 @@ import numpy as np
 import pytest
 import warp as wp
 from cut_cases import assert_cut_sound
-from remesh_cases import momentum, moving, random_marks
+from remesh_cases import RemeshPass, counts_of, is_full, momentum, moving, random_marks
 from remeshed import bar, near, twin
 
 import warp_corot as wc
-from warp_corot.discretization.changing.cutting import CutPass, plane_surface
-from warp_corot.discretization.changing.passes import RemeshPass
+from warp_corot.discretization.changing.passes import CutPass, plane_surface
 from warp_corot.kernels.remesh.cut_surface import Surface
 
 STEPS = wc.SymplecticEuler(dt=2e-4, damping=1.0)
@@ -36,9 +35,9 @@ def test_cuts_of_an_adaptive_forest_are_sound(device, rng):
         normal, offset = random_plane(rng, forest.source)
         cuts.launch_cut(plane_surface(normal, offset, is_deformed=k % 2 == 1))
         assert_cut_sound(forest)
-        assert forest.counts().added > 0
+        assert counts_of(forest).added > 0
     np.testing.assert_allclose(momentum(forest)[0], before, atol=1e-12 * size)
-    assert not forest.is_full
+    assert not is_full(forest)
 
 
 def test_a_plane_separates_the_elements_on_both_sides(device, rng):

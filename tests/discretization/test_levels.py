@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from remesh_cases import random_marks
+from remesh_cases import apply_marks, counts_of, random_marks
 from remeshed import SOFT
 from tree_levels import TreeLevels
 from volumes import blobs
@@ -72,9 +72,9 @@ def remesh(body, rng, passes):
     """Refine and simplify at random; returns the numbers of new and removed nodes."""
     added = removed = 0
     for _ in range(passes):
-        body.changing.passes.apply(random_marks(body.changing.forest, rng, 0.05, 0.3))
+        apply_marks(body.changing.passes, random_marks(body.changing.forest, rng, 0.05, 0.3))
         body.changing.renew()
-        counts = body.changing.forest.counts()
+        counts = counts_of(body.changing.forest)
         added, removed = added + counts.added, removed + counts.removed
     assert not body.changing.is_full
     return added, removed

@@ -5,7 +5,7 @@ import oracle
 import pytest
 from cases import CUBE, MESHES, edge_scale, mixed_forest, oracle_mesh, random_displacement
 from fibres import made, muscle, random_axes, wood, wood_tensor
-from remesh_cases import random_marks
+from remesh_cases import apply_marks, random_marks
 from tangents import (
     assert_diagonal,
     assert_equal,
@@ -168,7 +168,7 @@ def test_a_mesh_that_has_changed(device, rng):
     sim = wc.Simulation(body, remesh=options)
     changing, field = sim.remeshing.changing[0], sim.fields[0]
     for _ in range(2):
-        changing.passes.apply(random_marks(changing.forest, rng, 0.05, 0.2))
+        apply_marks(changing.passes, random_marks(changing.forest, rng, 0.05, 0.2))
         changing.renew()
         mesh, count, places = changing.forest.to_forest(), body.node_count, len(body.node_displacements)
         other, alone = bound(mesh, body.material, device)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import warp as wp
-from remesh_cases import CUBE, random_marks
+from remesh_cases import CUBE, apply_marks, random_marks
 
 import warp_corot as wc
 from warp_corot.elasticity.model import isotropic_material
@@ -74,7 +74,7 @@ def test_a_field_bound_to_a_remeshed_body_uses_its_present_mesh(model, device, r
     sim = wc.Simulation(body, model=model, remesh=options)
     changing = sim.remeshing.changing[0]
     for _ in range(2):
-        changing.passes.apply(random_marks(changing.forest, rng, 0.05, 0.2))
+        apply_marks(changing.passes, random_marks(changing.forest, rng, 0.05, 0.2))
         changing.renew()
         other = model.bind(body)
         assert other.plan is not sim.fields[0].plan

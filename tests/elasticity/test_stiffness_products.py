@@ -8,7 +8,7 @@ import oracle
 import pytest
 import warp as wp
 from cases import MATERIAL, MESHES, MODELS, edge_scale, jittered, mixed_forest, oracle_mesh, random_displacement
-from remesh_cases import CUBE, random_marks
+from remesh_cases import CUBE, apply_marks, random_marks
 from shortened import crossed
 from tangents import (
     assert_diagonal,
@@ -166,7 +166,7 @@ def test_a_mesh_that_has_changed(model, device, rng):
     sim = wc.Simulation(body, model=REMESHED[model], remesh=options)
     changing, field = sim.remeshing.changing[0], sim.fields[0]
     for _ in range(2):
-        changing.passes.apply(random_marks(changing.forest, rng, 0.05, 0.2))
+        apply_marks(changing.passes, random_marks(changing.forest, rng, 0.05, 0.2))
         changing.renew()
         mesh, count, places = changing.forest.to_forest(), body.node_count, len(body.node_displacements)
         alone = REMESHED[model].bind(wc.SoftBody(mesh, body.material, device=device))

@@ -2,10 +2,21 @@
 
 import numpy as np
 import pytest
-from remesh_cases import CUBE, DENSITY, assert_sound, leaf_list, moving, random_marks, set_nodes
+from remesh_cases import (
+    CUBE,
+    DENSITY,
+    RemeshPass,
+    assert_sound,
+    counts_of,
+    is_full,
+    leaf_list,
+    moving,
+    random_marks,
+    set_nodes,
+    support_impulse,
+)
 
 import warp_corot as wc
-from warp_corot.discretization.changing.passes import RemeshPass
 from warp_corot.discretization.changing.pools import (
     CARRIED_BY_NODES,
     CARRIED_BY_TETRAHEDRA,
@@ -118,10 +129,10 @@ def test_what_the_last_pass_did_is_counted(device, rng):
     for chances in [(0.3, 0.2), (0.0, 0.9), (0.0, 0.0), (0.1, 0.6), (1.0, 0.0), (1.0, 0.0), (1.0, 0.0), (1.0, 0.0)]:
         before = set(points_of(adaptive))
         remesh.apply(random_marks(adaptive, rng, *chances))
-        counts, mesh, after = adaptive.counts(), adaptive.to_forest(), set(points_of(adaptive))
+        counts, mesh, after = counts_of(adaptive), adaptive.to_forest(), set(points_of(adaptive))
         assert (counts.leaves, counts.nodes) == (len(mesh.tets), len(mesh.points))
         assert (counts.added, counts.removed) == (len(after - before), len(before - after))
-        assert counts.full == adaptive.is_full
+        assert counts.full == is_full(adaptive)
     assert counts.full
 
 
@@ -160,7 +171,7 @@ def test_new_held_nodes_follow_the_row_that_both_ends_follow(device, rng):
 def in_use(device):
     """All used parts of all arrays, by name."""
     nodes, elements = device.nodes_in_use, np.flatnonzero(device.pools.level.numpy() >= 0)
-    found = {"leaves": device.leaf_elements.copy(), "impulse": device.carriage.support_impulse.copy()}
+    found = {"leaves": device.leaf_elements.copy(), "impulse": support_impulse(device).copy()}
     for struct, names, places in (
         (device.pools, OF_NODES, nodes),
         (device.carriage.arrays, CARRIED_BY_NODES, nodes),
@@ -218,10 +229,10 @@ def test_a_mesh_restarts_at_what_it_began_as(kind, device, rng):
     remesh, first = RemeshPass(adaptive), in_use(adaptive)
     for _ in range(4):
         remesh.apply(np.ones(adaptive.leaf_count, int))
-    assert adaptive.is_full
+    assert is_full(adaptive)
     adaptive.restart()
     assert_same_state(adaptive, first)
-    assert not adaptive.is_full
+    assert not is_full(adaptive)
     assert np.array_equal(assert_sound(adaptive).tets, forest.tets)
     for _ in range(4):
         remesh.apply(np.full(adaptive.leaf_count, -1))

@@ -5,11 +5,10 @@ import functools
 import numpy as np
 import pytest
 import warp as wp
-from remesh_cases import set_nodes
+from remesh_cases import RemeshPass, set_nodes
 from studies import study
 
 import warp_corot as wc
-from warp_corot.discretization.changing.passes import RemeshPass
 from warp_corot.discretization.changing.pools import DeviceForest
 from warp_corot.kernels.remesh.criteria import nearness, strain, von_mises_stress
 

@@ -3,11 +3,10 @@
 import numpy as np
 import pytest
 import warp as wp
-from remesh_cases import CUBE, random_marks
+from remesh_cases import CUBE, RemeshPass, apply_marks, random_marks
 from shortened import crossed
 
 import warp_corot as wc
-from warp_corot.discretization.changing.passes import RemeshPass
 from warp_corot.discretization.changing.plan import DevicePlan, launch_size
 from warp_corot.discretization.changing.pools import DeviceForest
 from warp_corot.discretization.elements import device_elements
@@ -227,7 +226,7 @@ def remeshed(mesh, material, model, device, rng):
     sim = wc.Simulation(body, model=model, remesh=options)
     changing = sim.remeshing.changing[0]
     for _ in range(3):
-        changing.passes.apply(random_marks(changing.forest, rng, 0.02, 0.2))
+        apply_marks(changing.passes, random_marks(changing.forest, rng, 0.02, 0.2))
     changing.renew()
     assert sim.fields[0].plan is body.discretization.kept
     return sim.fields[0], changing.forest

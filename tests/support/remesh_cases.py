@@ -4,17 +4,80 @@ import itertools
 
 import numpy as np
 import pytest
+import warp as wp
 from plan_oracle import shape_codes
 from sequential import Bisection
 
-from warp_corot.discretization.changing.pools import CARRIED_BY_NODES, DeviceForest
+from warp_corot.discretization.changing import passes
+from warp_corot.discretization.changing.pools import CARRIED_BY_NODES, DeviceForest, PassCounts
 from warp_corot.discretization.sizes import padded
+from warp_corot.kernels.remesh import pools
 from warp_corot.kernels.tables.shapes import FRAME_SHIFT
 from warp_corot.mesh.lattice import LATTICE_BITS
 
 CUBE = 0.064
 DENSITY = 1000.0
 PAIRS = list(itertools.combinations(range(4), 2))
+
+
+def set_marks(forest, marks):
+    """1 for leaves to bisect, -1 for leaves that may be merged, 0 for the others, [T]."""
+    whole = np.zeros(len(forest.pools.marks), np.int8)
+    whole[: forest.leaf_count] = marks
+    forest.pools.marks.assign(whole)
+
+
+def apply_marks(remesh, marks):
+    """Change a mesh by a pass with these marks instead of the criterion."""
+    set_marks(remesh.forest, marks)
+    remesh.launch(marked=True)
+
+
+class RemeshPass(passes.RemeshPass):
+    """Passes that are recorded once and replayed, by the criterion or by marks."""
+
+    def run(self):
+        self._replay(marked=False)
+
+    def apply(self, marks):
+        set_marks(self.forest, marks)
+        self._replay(marked=True)
+
+    def _replay(self, *, marked):
+        if self.device.is_cuda and not wp.is_conditional_graph_supported():
+            self.launch(marked=marked)
+            return
+        graphs = self.__dict__.setdefault("graphs", {})
+        if marked not in graphs:
+            with wp.ScopedCapture(device=self.device) as capture:
+                self.launch(marked=marked)
+            graphs[marked] = capture.graph
+        wp.capture_launch(graphs[marked])
+
+
+def free_nodes(device):
+    """The number of further nodes for which there is room."""
+    return device.node_capacity - device.virtual_count - device.node_count
+
+
+def free_leaves(device):
+    """The number of further leaves for which there is room."""
+    return device.count(pools.FREE_PAIRS)
+
+
+def is_full(device):
+    """Whether a refinement was ever left out because the pools were full."""
+    return bool(device.count(pools.FULL))
+
+
+def counts_of(device):
+    """The counts after the last pass."""
+    return PassCounts.of(device.pools.counts.numpy())
+
+
+def support_impulse(device):
+    """Impulse of the supports in all passes, as mass came to and left held nodes [N s], float64 [3]."""
+    return device.carriage.arrays.impulse.numpy()[0]
 
 
 def leaf_list(forest):
@@ -73,7 +136,7 @@ def assert_balanced(device):
     tree, used = device.tree()
     count, limit = device.node_count, device.node_capacity - device.virtual_count
     assert np.array_equal(np.unique(device.leaf_tets), np.arange(count))
-    assert device.free_nodes == limit - count
+    assert free_nodes(device) == limit - count
     valence = device.pools.valence.numpy()
     names = np.bincount(tree.tets[tree.first_child < 0].ravel(), minlength=device.node_capacity)
     assert np.array_equal(names, valence)
@@ -82,7 +145,7 @@ def assert_balanced(device):
     inner = tree.first_child[tree.first_child >= 0]
     below = np.concatenate([tree.tets[inner], tree.tets[inner + 1]], axis=1)
     assert (tree.tets[tree.first_child >= 0][:, :, None] == below[:, None, :]).any(axis=2).all()
-    pairs = device.pools.free_pairs.numpy()[: device.free_leaves]
+    pairs = device.pools.free_pairs.numpy()[: free_leaves(device)]
     unused = np.setdiff1d(np.arange(device.pools.roots, device.tree_capacity), used)
     assert np.array_equal(np.sort(np.concatenate([pairs, pairs + 1])), unused)
 

@@ -10,6 +10,7 @@ import numpy as np
 import warp as wp
 
 from warp_corot.contact.obstacles import Obstacles
+from warp_corot.discretization.sizes import allocated
 from warp_corot.errors import InputError
 from warp_corot.kernels.remesh import blades as kernels
 from warp_corot.kernels.remesh.cut_surface import BUNDLE, Surface
@@ -49,31 +50,21 @@ class EdgePoints:
         rows = [blade.sampled(SPACING * size) for blade in blades]
         counts = [len(row) for row in rows]
         self.count = total = sum(counts)
-        edges = self.edges = kernels.Edges()
+        of_points = "x best nodes weights size modulus dt state swept former"
+        sizes = [(total, of_points), (2 * total, "push move"), (2, "bounds"), (len(rows), "work")]
+        edges = self.edges = allocated(kernels.Edges, self.device, sizes)
         edges.blade = self._ints(np.repeat(np.arange(len(rows)), counts))
         edges.local = wp.array(np.concatenate(rows), dtype=wp.vec3, device=self.device)
         goes_on = np.ones(total, np.int32)
         goes_on[np.cumsum(counts) - 1] = 0
         edges.goes_on = self._ints(goes_on)
-        edges.x, edges.bounds = wp.zeros(total, dtype=wp.vec3, device=self.device), self._boxes(1)
-        edges.push, edges.move = (wp.zeros(2 * total, dtype=wp.vec3, device=self.device) for _ in range(2))
-        edges.dt = wp.zeros(total, dtype=wp.float32, device=self.device)
-        edges.best = wp.zeros(total, dtype=wp.int64, device=self.device)
-        edges.nodes = wp.zeros(total, dtype=wp.vec4i, device=self.device)
-        edges.weights = wp.zeros(total, dtype=wp.vec4, device=self.device)
-        edges.size, edges.modulus = (wp.zeros(total, dtype=wp.float32, device=self.device) for _ in range(2))
-        edges.state, edges.swept = (wp.zeros(total, dtype=wp.int32, device=self.device) for _ in range(2))
-        edges.former = wp.zeros(total, dtype=wp.vec3, device=self.device)
-        edges.work = wp.zeros(len(rows), dtype=wp.float64, device=self.device)
         edges.common = changing.carried_material.modulus
-        surface = self.surface = Surface()
+        boxes = 1 + -(-2 * total // int(BUNDLE))
+        sizes = [(3 * total, "points"), (2 * total, "triangles debt"), (2 * boxes, "bounds")]
+        surface = self.surface = allocated(Surface, self.device, sizes)
         surface.count = 2 * total
-        surface.points = wp.zeros(3 * total, dtype=wp.vec3d, device=self.device)
-        surface.triangles = wp.zeros(2 * total, dtype=wp.vec3i, device=self.device)
-        surface.bounds = self._boxes(1 + -(-surface.count // int(BUNDLE)))
         levels = [-1 if blade.level is None else blade.level for blade in blades]
         surface.levels = self._ints(np.repeat(levels, 2 * np.array(counts)))
-        surface.debt = wp.zeros(2 * total, dtype=wp.float64, device=self.device)
         self.refines = max(levels) >= 0
         self._graph: wp.Graph | None = None
         self._is_recorded = False
@@ -141,9 +132,6 @@ class EdgePoints:
     def _launch(self, kernel: wp.Kernel, inputs: list[Any], dim: int | None = None) -> None:
         """Launch a kernel over the points, or another number of threads."""
         wp.launch(kernel, self.count if dim is None else dim, inputs, device=self.device)
-
-    def _boxes(self, count: int) -> wp.array:
-        return wp.zeros(2 * count, dtype=wp.vec3d, device=self.device)
 
     def _ints(self, values: Any) -> wp.array:
         return wp.array(np.asarray(values, np.int32), dtype=wp.int32, device=self.device)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -21,6 +22,23 @@ class Clock(Protocol):
 
     @property
     def arrays(self) -> Pace: ...
+
+
+def allocated(struct: Any, device: wp.Device, sizes: Iterable[tuple[Any, str]], **values: int) -> Any:
+    """A struct of kernels with new arrays.
+
+    Args:
+        struct: The struct.
+        device: Where the arrays are.
+        sizes: Sizes or shapes, each with the names of arrays.
+        values: What fills arrays that do not begin with zeros.
+    """
+    made = struct()
+    for shape, names in sizes:
+        for name in names.split():
+            dtype = struct.vars[name].type.dtype
+            setattr(made, name, wp.full(shape, values.get(name, 0), dtype=dtype, device=device))
+    return made
 
 
 # --- nodal vectors ---------------------------------------------------------------------------------------------------

@@ -10,18 +10,8 @@ import warp as wp
 
 from warp_corot.inputs.arguments import forwards
 
-from .shapes import (
-    BoxDomain,
-    CapsuleDomain,
-    DifferenceDomain,
-    Function,
-    FunctionDomain,
-    IntersectionDomain,
-    NamedDomain,
-    SphereDomain,
-    TorusDomain,
-    UnionDomain,
-)
+from . import shapes
+from .shapes import DifferenceDomain, Function, FunctionDomain, IntersectionDomain, NamedDomain, UnionDomain
 from .signed import SignedFunction
 
 if TYPE_CHECKING:
@@ -153,7 +143,7 @@ class Domain(SignedFunction):
         """
         from .labels import label_domain
 
-        return _Made(label_domain(volume, spacing, origin, affine, labels, unit, smoothing, up_axis, device))
+        return _Made(label_domain(volume, labels, (spacing, origin, affine, unit), smoothing, up_axis, device))
 
     @classmethod
     def from_probabilities(
@@ -182,7 +172,7 @@ class Domain(SignedFunction):
         """
         from .labels import probability_domain
 
-        return _Made(probability_domain(maps, certain, spacing, origin, affine, unit, smoothing, up_axis, device))
+        return _Made(probability_domain(maps, certain, (spacing, origin, affine, unit), smoothing, up_axis, device))
 
     @classmethod
     def from_function(
@@ -213,24 +203,24 @@ class Domain(SignedFunction):
     @classmethod
     def sphere(cls, radius: float, centre: Sequence[float] = (0.0, 0.0, 0.0), **options: Any) -> Domain:
         """A ball [m]. Options here and below: ``up_axis``, ``device``."""
-        return _Made(SphereDomain(radius, centre, **options))
+        return _Made(shapes.sphere(radius, centre, **options))
 
     @classmethod
     def box(cls, lower: Sequence[float], upper: Sequence[float], **options: Any) -> Domain:
         """An axis-aligned box between two corners [m]."""
-        return _Made(BoxDomain(lower, upper, **options))
+        return _Made(shapes.box(lower, upper, **options))
 
     @classmethod
     def torus(
         cls, major: float, minor: float, centre: Sequence[float] = (0.0, 0.0, 0.0), axis: str = "Z", **options: Any
     ) -> Domain:
         """A ring: a tube of radius ``minor`` around a circle of radius ``major`` [m] about an axis."""
-        return _Made(TorusDomain(major, minor, centre, axis, **options))
+        return _Made(shapes.torus(major, minor, centre, axis, **options))
 
     @classmethod
     def capsule(cls, start: Sequence[float], end: Sequence[float], radius: float, **options: Any) -> Domain:
         """All points within ``radius`` of the segment between two points [m]."""
-        return _Made(CapsuleDomain(start, end, radius, **options))
+        return _Made(shapes.capsule(start, end, radius, **options))
 
 
 @forwards("kind", "has_pieces", "holds", "exits", "points_in", "label_volumes")

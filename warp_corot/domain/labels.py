@@ -435,38 +435,22 @@ class LabelDomain(SignedFunction):
         ]
 
 
-def label_domain(
-    given: Volume,
-    spacing: Sequence[float] | None,
-    origin: Sequence[float] | None,
-    affine: npt.ArrayLike | None,
-    labels: Mapping[str, int | Sequence[int]] | None,
-    unit: str | float | None,
-    smoothing: float,
-    up_axis: str,
-    device: Any,
-) -> SignedFunction:
+#: Spacing, origin, affine and unit, as for ``Domain.from_labels``.
+Placing = tuple[Sequence[float] | None, Sequence[float] | None, npt.ArrayLike | None, str | float | None]
+
+
+def label_domain(given: Volume, labels: Any, placing: Placing, *options: Any) -> SignedFunction:
     """See `Domain.from_labels`."""
-    grid = placed_grid(given, spacing, origin, affine, unit)
+    grid = placed_grid(given, *placing)
     numbers, names = numbered_labels(grid.values, labels)
-    return _domain(grid, numbers, names, smoothing, up_axis, device, unit)
+    return _domain(grid, numbers, names, placing[-1], *options)
 
 
-def probability_domain(
-    maps: Mapping[str, Volume],
-    certain: float,
-    spacing: Sequence[float] | None,
-    origin: Sequence[float] | None,
-    affine: npt.ArrayLike | None,
-    unit: str | float | None,
-    smoothing: float,
-    up_axis: str,
-    device: Any,
-) -> SignedFunction:
+def probability_domain(maps: Mapping[str, Volume], certain: float, placing: Placing, *options: Any) -> SignedFunction:
     """See `Domain.from_probabilities`."""
     if not (isinstance(maps, Mapping) and maps):
         raise InputError("maps is empty; it must give at least one volume by label name")
-    grids = {name: placed_grid(given, spacing, origin, affine, unit) for name, given in maps.items()}
+    grids = {name: placed_grid(given, *placing) for name, given in maps.items()}
     first_name, first = next(iter(grids.items()))
     for name, grid in grids.items():
         if grid.values.shape == first.values.shape and not np.allclose(grid.affine, first.affine, atol=1e-6):
@@ -474,11 +458,11 @@ def probability_domain(
     numbers = labels_from_probabilities({name: grid.values for name, grid in grids.items()}, certain=certain)
     if not numbers.any():
         raise InputError("no voxel of the maps is likelier inside than outside; are they in the range 0 to certain?")
-    return _domain(first, numbers.astype(np.int16), list(maps), smoothing, up_axis, device, unit)
+    return _domain(first, numbers.astype(np.int16), list(maps), placing[-1], *options)
 
 
 def _domain(
-    grid: Grid, numbers: np.ndarray, names: Sequence[str], smoothing: float, up_axis: str, device: Any, unit: Any
+    grid: Grid, numbers: np.ndarray, names: Sequence[str], unit: Any, smoothing: float, up_axis: str, device: Any
 ) -> SignedFunction:
     if not 0.0 <= checked_number(smoothing, "smoothing", "m") < np.inf:
         raise InputError(f"smoothing is {smoothing!r}; it must be a length [m], 0 for none")

@@ -10,8 +10,7 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from warp_corot.discretization.changing.cutting import CutPass
-from warp_corot.discretization.changing.passes import RemeshPass, Survey
+from warp_corot.discretization.changing.passes import CutPass, RemeshPass, Survey
 from warp_corot.discretization.changing.plan import DevicePlan, launch_size
 from warp_corot.discretization.changing.pools import DeviceForest, PassCounts
 from warp_corot.discretization.changing.transfer import Column

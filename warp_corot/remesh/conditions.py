@@ -10,59 +10,67 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from warp_corot.body.keyframes import Followed, NodeKeyframes
+from warp_corot.body.keyframes import Followed
 from warp_corot.discretization.changing.pools import DeviceForest
 from warp_corot.kernels.plan.changing import begin_counts
 from warp_corot.kernels.remesh import derived as kernels
 from warp_corot.kernels.remesh.pools import MIXED_ROWS, NO_ROW
-from warp_corot.remesh.carried_material import ACTIVATION, ACTIVATION_ROW, CarriedActivation
+from warp_corot.remesh.carried_material import ACTIVATION, ACTIVATION_ROW
 
 if TYPE_CHECKING:
     from warp_corot.body.soft_body import SoftBody
 
 
 @dataclass(frozen=True, eq=False)
-class Row:
-    """Keyframes of one node: times [s], [K], and displacements [m], [K, 3]."""
+class Keys:
+    """Keyframes of rows ``first`` and following: times [s], [K], and displacements [m], [K, rows, 3], or active stress
+    [Pa], [K, rows]."""
 
+    first: int
     times: npt.NDArray[np.float64]
-    displacements: npt.NDArray[np.float64]
+    values: npt.NDArray[np.floating]
 
-    def at(self, times: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-        """Displacements at other times, [n, 3]."""
-        return np.stack([np.interp(times, self.times, self.displacements[:, axis]) for axis in range(3)], axis=1)
+    @property
+    def end(self) -> int:
+        return self.first + self.values.shape[1]
+
+    def follow(self, rows: npt.NDArray[np.int32]) -> npt.NDArray[np.bool_]:
+        """Which nodes or elements have a row in these keyframes."""
+        return (rows >= self.first) & (rows < self.end)
+
+    def at(self, row: int, times: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+        """Displacements of a row at other times [m], [n, 3]."""
+        own = self.values[:, row - self.first]
+        return np.stack([np.interp(times, self.times, own[:, axis]) for axis in range(3)], axis=1)
 
 
 class Keyframes:
-    """The rows of keyframes that nodes follow; ``Carried.row`` has each node's number.
+    """The rows of keyframes that nodes or elements follow, each of which carries the number of its row.
 
     Attributes:
-        rows: The rows by their numbers.
+        keys: The rows, ascending.
         between: The two rows whose mean a row is.
+        made: The keyframes that were made or adopted last.
     """
 
     def __init__(self) -> None:
-        self.rows: dict[int, Row] = {}
+        self.keys: list[Keys] = []
         self.between: dict[tuple[int, int], int] = {}
-        self._trajectories: list[Followed] = []
-        #: The nodes and rows from which these were made; None if they were not made here.
-        self._made_of: tuple[npt.NDArray[np.int32], npt.NDArray[np.int32]] | None = None
+        self.made: list[Followed] = []
+        #: The numbers and rows from which these were made; None if they were not made here.
+        self._made_of: tuple[npt.NDArray[np.integer], npt.NDArray[np.int32]] | None = None
 
-    def are(self, trajectories: Sequence[Followed]) -> bool:
-        """Whether these trajectories are those made or adopted last."""
-        return len(trajectories) == len(self._trajectories) and all(
-            a is b for a, b in zip(trajectories, self._trajectories, strict=True)
-        )
+    def are(self, followed: Sequence[Followed]) -> bool:
+        """Whether these keyframes are those made or adopted last."""
+        return len(followed) == len(self.made) and all(a is b for a, b in zip(followed, self.made, strict=True))
 
-    def adopt(self, trajectories: Sequence[Followed], node_count: int) -> npt.NDArray[np.int32]:
-        """Adopt trajectories, and return the row that each node follows, int32 [N]."""
-        found = np.full(node_count, int(NO_ROW), np.int32)
-        for trajectory in trajectories:
-            times, displacements = trajectory.keys()
-            columns = displacements[:, None] if displacements.ndim == 2 else displacements
-            numbers = [self._add(Row(times.copy(), column.copy())) for column in np.moveaxis(columns, 1, 0)]
-            found[trajectory.host_numbers] = numbers
-        self._trajectories, self._made_of = list(trajectories), None
+    def adopt(self, followed: Sequence[Followed], count: int) -> npt.NDArray[np.int32]:
+        """Adopt keyframes, and return the row that each of ``count`` nodes or elements follows, int32."""
+        found = np.full(count, int(NO_ROW), np.int32)
+        for each in followed:
+            keys, numbers = self._add(each.times.numpy().copy(), each.values.numpy().copy()), each.host_numbers
+            found[numbers] = keys.first + (np.arange(len(numbers)) if keys.end - keys.first > 1 else 0)
+        self.made, self._made_of = list(followed), None
         return found
 
     def settle(
@@ -84,42 +92,44 @@ class Keyframes:
             left = left[~known]
         return settled
 
-    def trajectories(
-        self, nodes: npt.NDArray[np.int32], rows: npt.NDArray[np.int32], device: wp.Device
+    def make(
+        self, numbers: npt.NDArray[np.integer], rows: npt.NDArray[np.int32], dtype: type, device: wp.Device
     ) -> list[Followed]:
-        """The nodes' keyframes as trajectories; the last ones if they are still valid.
+        """The keyframes of nodes or elements; the last ones if they are still valid.
 
         Args:
-            nodes: Nodes that follow a row, ascending, int32 [n].
+            numbers: Those that follow a row, ascending [n].
             rows: The row of each, int32 [n].
+            dtype: Of the values.
             device: The device of the result.
         """
-        of = nodes, rows
+        of = numbers, rows
         if self._made_of is not None and all(map(np.array_equal, of, self._made_of)):
-            return self._trajectories
+            return self.made
+        alike: dict[bytes, list[Keys]] = {}
+        for keys in self.keys:
+            if keys.follow(rows).any():
+                alike.setdefault(keys.times.tobytes(), []).append(keys)
         made = []
-        of_times: dict[bytes, list[int]] = {}
-        for row in np.unique(rows).tolist():
-            of_times.setdefault(self.rows[row].times.tobytes(), []).append(row)
-        for same_times in of_times.values():
-            chosen = np.isin(rows, same_times)
-            times = self.rows[same_times[0]].times
-            if len(same_times) == 1:
-                displacements = self.rows[same_times[0]].displacements
-            else:
-                displacements = np.stack([self.rows[row].displacements for row in rows[chosen].tolist()], axis=1)
-            made.append(NodeKeyframes.checked(nodes[chosen], times, displacements).on(device))
-        if not _alike(made, self._trajectories):
-            self._trajectories = made
+        for same_times in alike.values():
+            there = np.concatenate([np.arange(keys.first, keys.end) for keys in same_times])
+            values = np.concatenate([keys.values for keys in same_times], axis=1)
+            chosen = np.isin(rows, there)
+            column = np.searchsorted(there, rows[chosen])
+            column = column[:1] if (column == column[0]).all() else column
+            made.append(Followed.made(numbers[chosen], same_times[0].times, values[:, column], dtype, device))
+        if not _alike(made, self.made):
+            self.made = made
         self._made_of = of
-        return self._trajectories
+        return self.made
 
-    def forget(self, but: set[int]) -> None:
-        """Keep only the rows with these numbers."""
-        wanted = but & self.rows.keys()
-        if len(wanted) < len(self.rows):
-            self.rows = {number: row for number, row in self.rows.items() if number in wanted}
-            self.between = {ends: row for ends, row in self.between.items() if {*ends, row} <= wanted}
+    def forget(self, but: npt.NDArray[np.int32]) -> None:
+        """Forget keyframes with none of these rows."""
+        self.keys = [keys for keys in self.keys if keys.follow(but).any()]
+        self.between = {ends: row for ends, row in self.between.items() if all(map(self._of, (*ends, row)))}
+
+    def _of(self, row: int) -> Keys | None:
+        return next((keys for keys in self.keys if keys.first <= row < keys.end), None)
 
     def _mean_row(
         self, ends: npt.NDArray[np.int32], rows: npt.NDArray[np.int32], displacements: npt.NDArray[np.floating]
@@ -127,29 +137,101 @@ class Keyframes:
         a, b = sorted(int(row) for row in rows[ends])
         if a >= 0 and (a, b) in self.between:
             return self.between[a, b]
-        followed = [self.rows[row] for row in (a, b) if row >= 0]
-        times = np.unique(np.concatenate([row.times for row in followed]))
+        followed = [(row, keys) for row in (a, b) if (keys := self._of(row))]
+        times = np.unique(np.concatenate([keys.times for _, keys in followed]))
         stays = [np.tile(displacements[end], (len(times), 1)) for end in ends if rows[end] < 0]
-        mean = np.mean([row.at(times) for row in followed] + stays, axis=0)
-        number = self._add(Row(times, mean))
+        mean = np.mean([keys.at(row, times) for row, keys in followed] + stays, axis=0)
+        number = self._add(times, mean[:, None]).first
         if a >= 0:
             self.between[a, b] = number
         return number
 
-    def _add(self, row: Row) -> int:
-        number = max(self.rows, default=-1) + 1
-        self.rows[number] = row
-        return number
+    def _add(self, times: npt.NDArray[np.float64], values: npt.NDArray[np.floating]) -> Keys:
+        keys = Keys(self.keys[-1].end if self.keys else 0, times, values)
+        self.keys.append(keys)
+        return keys
 
 
 def _alike(ones: Sequence[Followed], others: Sequence[Followed]) -> bool:
-    """Whether two lists of trajectories have the same nodes on the same keyframes, in the same order."""
+    """Whether two lists of keyframes have the same followers and values, in the same order."""
     return len(ones) == len(others) and all(
         np.array_equal(a.host_numbers, b.host_numbers)
         and np.array_equal(a.times.numpy(), b.times.numpy())
         and np.array_equal(a.values.numpy(), b.values.numpy())
         for a, b in zip(ones, others, strict=True)
     )
+
+
+class CarriedActivation:
+    """Active stress that elements carry, passed between body and pools; bodies without active stress are left alone.
+
+    Args:
+        body: The body.
+        forest: Its pools.
+
+    Attributes:
+        keyframes: The keyframes that elements follow, or followed on the mesh that ``put_back`` restores.
+    """
+
+    def __init__(self, body: SoftBody, forest: DeviceForest):
+        self._body = body
+        self._forest = forest
+        self.keyframes = Keyframes()
+
+    def note(self, kept_rows: wp.array | None) -> None:
+        """Read the user's changes.
+
+        Args:
+            kept_rows: Rows that ``put_back`` may write, whose keyframes must be kept.
+        """
+        body, keyframes = self._body, self.keyframes
+        if not body.discretization.has_activation:
+            return
+        self._write(ACTIVATION, body.discretization.activation[: body.element_count])
+        if not keyframes.are(body.conditions.activations):
+            keyframes.forget(but=np.empty(0, np.int32) if kept_rows is None else kept_rows.numpy())
+            rows = keyframes.adopt(body.conditions.activations, body.element_count)
+            self._write(ACTIVATION_ROW, wp.array(rows, dtype=wp.int32, device=body.device))
+
+    def kept(self) -> dict[str, wp.array]:
+        """The data for ``put_back``, on the current mesh."""
+        if not self._body.discretization.has_activation:
+            return {}
+        return {name: self._read(name) for name in (ACTIVATION, ACTIVATION_ROW)}
+
+    def put_back(self, kept: dict[str, wp.array]) -> None:
+        """Write the data into the mesh from which they came; the pools hold that mesh already."""
+        for name in (ACTIVATION, ACTIVATION_ROW):
+            if name in kept:
+                self._write(name, kept[name])
+
+    def follow(self) -> None:
+        """Make the body's elements follow the keyframes of the rows that they carry."""
+        if self.keyframes.keys:
+            rows = self._read(ACTIVATION_ROW).numpy()
+            elements = np.flatnonzero(rows >= 0)
+            made = self.keyframes.make(elements, rows[elements], wp.float32, self._body.device)
+            if made is not self._body.conditions.activations:
+                self._body.conditions.set_activations(made)
+
+    def _write(self, name: str, given: wp.array) -> None:
+        columns, number = self._columns(name)
+        inputs = [self._forest.pools.leaves, given, number]
+        wp.launch(kernels.WRITE_LEAVES[given.dtype], len(given), inputs, [columns], device=self._body.device)
+
+    def _read(self, name: str) -> wp.array:
+        columns, number = self._columns(name)
+        count = self._body.element_count
+        found = wp.empty(count, dtype=columns.dtype, device=self._body.device)
+        inputs = [self._forest.pools.leaves, columns, number]
+        wp.launch(kernels.READ_LEAVES[found.dtype], count, inputs, [found], device=self._body.device)
+        return found
+
+    def _columns(self, name: str) -> tuple[wp.array, int]:
+        carriage = self._forest.carriage
+        if name in carriage.names:
+            return carriage.arrays.values, carriage.names.index(name)
+        return carriage.arrays.numbers, carriage.number_names.index(name)
 
 
 #: The arrays that ``put_back`` restores.
@@ -186,7 +268,7 @@ class CarriedConditions:
         self._is_back = False
         self.kept: dict[str, wp.array] = {}
         #: The rows in ``kept``; None: not read yet.
-        self._kept_rows: set[int] | None = None
+        self._kept_rows: npt.NDArray[np.int32] | None = None
         self.found = wp.zeros(kernels.FOLLOWER_PLACES, dtype=wp.int32, device=forest.device)
         #: Nodes that follow keyframes, and their rows, in any order.
         self._followers = [wp.empty(forest.node_capacity, dtype=wp.int32, device=forest.device) for _ in range(2)]
@@ -254,7 +336,7 @@ class CarriedConditions:
         order = np.argsort(nodes)
         nodes, rows = nodes[order], rows[order]
         self._forget(rows)
-        trajectories = self.keyframes.trajectories(nodes, rows, body.device)
+        trajectories = self.keyframes.make(nodes, rows, wp.vec3, body.device)
         if trajectories is not body.conditions.trajectories:
             body.conditions.set_trajectories(trajectories)
 
@@ -279,8 +361,8 @@ class CarriedConditions:
     def _forget(self, rows: npt.NDArray[np.int32]) -> None:
         """Forget the keyframes that no node follows, now or in ``kept``."""
         if self._kept_rows is None:
-            self._kept_rows = set(np.unique(self.kept["row"].numpy()).tolist()) if "row" in self.kept else set()
-        self.keyframes.forget(but=self._kept_rows.union(np.unique(rows).tolist()))
+            self._kept_rows = self.kept["row"].numpy() if "row" in self.kept else np.empty(0, np.int32)
+        self.keyframes.forget(but=np.concatenate([self._kept_rows, rows]))
 
     def _of_nodes(self, array: wp.array) -> npt.NDArray[Any]:
         return array[: self._body.node_count].numpy().copy()

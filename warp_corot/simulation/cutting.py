@@ -13,7 +13,7 @@ from warp_corot.contact.options import Contact
 from warp_corot.contact.tool import Obstacle
 from warp_corot.cutting.blade import Blade, Plane, checked_plane
 from warp_corot.cutting.blades import Blades
-from warp_corot.discretization.changing.cutting import plane_surface
+from warp_corot.discretization.changing.passes import plane_surface
 from warp_corot.elasticity import ForceField
 from warp_corot.errors import InputError, StabilityWarning, depth_of_user
 from warp_corot.inputs.checks import checked_number

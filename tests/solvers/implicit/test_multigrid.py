@@ -330,7 +330,7 @@ def test_updates_and_cycles_can_be_recorded(device, rng):
 
 
 def test_a_mesh_that_changes_is_followed(device, rng):
-    from remesh_cases import random_marks
+    from remesh_cases import apply_marks, random_marks
 
     mesh = ball()
     body = wc.SoftBody(mesh, wc.Isotropic(5e3, 0.3, 1e3), device=device)
@@ -338,7 +338,7 @@ def test_a_mesh_that_changes_is_followed(device, rng):
     multigrid = Multigrid(body)
     assert not multigrid.follow()
     for _ in range(2):
-        body.changing.passes.apply(random_marks(body.changing.forest, rng, 0.05, 0.3))
+        apply_marks(body.changing.passes, random_marks(body.changing.forest, rng, 0.05, 0.3))
         body.changing.renew()
         assert multigrid.follow()
         body.fix(lowest_tenth(body.mesh))

@@ -1,4 +1,5 @@
-"""One pass over a changing forest: mark, refine, simplify, sort the leaves. The host reads nothing.
+"""One pass over a changing forest: mark, refine, simplify, sort the leaves; or a cut: faces that a surface crosses,
+and the nodes that come apart with them. The host reads nothing.
 
 Also checks of the options of remeshing, whose messages have one form, NAME is VALUE; it must be …, with Python's names
 (``cli.bodies`` puts the options' names in their place); and the decision when the stable step must be found again."""
@@ -15,13 +16,17 @@ import numpy.typing as npt
 import warp as wp
 
 from warp_corot.discretization.changing.pools import DeviceForest
+from warp_corot.discretization.sizes import allocated
 from warp_corot.errors import InputError
 from warp_corot.inputs.checks import checked_number, shown
 from warp_corot.kernels.plan.changing import begin_counts
+from warp_corot.kernels.remesh import cut as cut_kernels
 from warp_corot.kernels.remesh import derived as kernels
 from warp_corot.kernels.remesh import order, refine, simplify
 from warp_corot.kernels.remesh import pools as pool_kernels
+from warp_corot.kernels.remesh import split as split_kernels
 from warp_corot.kernels.remesh.criteria import PARAMETER_COUNTS, Contents, elongation, marking_kernel
+from warp_corot.kernels.remesh.cut_surface import Surface
 from warp_corot.mesh.lattice import MAX_LEVEL, check_levels, lattice_spacing
 
 
@@ -97,7 +102,22 @@ def _finite(given: Any, name: str) -> float:
     return number
 
 
-class RemeshPass:
+class _Launches:
+    """Launches over a forest's pools."""
+
+    def __init__(self, forest: DeviceForest):
+        self.forest, self.device = forest, forest.device
+
+    def _once(self, kernel: wp.Kernel, *arguments: Any) -> None:
+        wp.launch(kernel, dim=1, inputs=list(arguments), device=self.device)
+
+    def _many(self, kernel: wp.Kernel, *arguments: Any) -> None:
+        """Launch a kernel in which each thread loops over a stretch of the items."""
+        threads = self.forest.threads
+        wp.launch(kernel, dim=threads, inputs=[threads, *arguments], device=self.device)
+
+
+class RemeshPass(_Launches):
     """A criterion and two thresholds, turned into launches that can be recorded.
 
     A leaf is bisected if the criterion is above one threshold, and merged with its sibling if it is below the other.
@@ -134,8 +154,7 @@ class RemeshPass:
     ):
         self.thresholds = checked_thresholds(refine_above, simplify_below)
         check_levels(min_level, max_level)
-        self.forest = forest
-        self.device = forest.device
+        super().__init__(forest)
         self.levels = (int(min_level or 0), int(max_level))
         self._kept = forest.pools.roots if min_level is not None else forest.begun_with
         self.parameters = wp.zeros(1, dtype=wp.float32, device=self.device) if parameters is None else parameters
@@ -143,36 +162,22 @@ class RemeshPass:
         self._origin = wp.vec3d(*forest.source.origin)
         self._spacing = lattice_spacing(forest.source.cell_size)
         self.contents = self._make_contents(lame)
-        self._edges = self._make_edges()
-        self._blocks = self._make_blocks()
-        self._removal = self._make_removal()
-        self._moves = self._make_moves()
+        nodes, threads, device = forest.node_capacity, forest.threads, self.device
+        size = 1 << (2 * (nodes + threads)).bit_length()
+        of_edges = [(size, "keys born ring agreed pairs head node wanted")]
+        begin = {"keys": -1, "born": int(refine.NEVER), "head": -1, "node": -1}
+        self._edges = allocated(refine.WantedEdges, device, of_edges, **begin)
+        # Threads that add an edge at the same time may exceed the limit, but never fill the table.
+        self._edges.most = size // 2
+        none, blocks = int(refine.NONE), forest.capacity // int(refine.BLOCK) + 1
+        of_blocks = [((nodes, refine.KEPT), "of_node"), (nodes, "latest"), (blocks, "hot"), (1, "all_hot")]
+        self._blocks = allocated(refine.Blocks, device, of_blocks, of_node=none, latest=none)
+        self._removal = allocated(simplify.Removal, device, [(nodes, "willing head candidates")], head=-1)
+        of_moves = [(nodes, "holes movers forward"), (2 * threads, "sums ends")]
+        self._moves = allocated(order.Moves, device, of_moves)
         self._demand = wp.zeros(1, dtype=wp.int64, device=self.device)
         self._goes_on = wp.zeros(1, dtype=wp.int32, device=self.device)
         self._sums, self._ends = (wp.zeros(forest.threads, dtype=wp.int32, device=self.device) for _ in range(2))
-        self._graphs: dict[bool, wp.Graph] = {}
-
-    def run(self) -> None:
-        """Mark the leaves by the criterion and change the mesh. The first call records the launches; others replay."""
-        self._replay(marked=False)
-
-    def apply(self, marks: npt.ArrayLike) -> None:
-        """Change the mesh by marks instead of the criterion.
-
-        Args:
-            marks: 1 for leaves to bisect, -1 for leaves that may be merged, 0 for the others, [T].
-
-        Raises:
-            InputError: The marks have other values or another number.
-        """
-        given = np.asarray(marks)
-        count = self.forest.leaf_count
-        if given.shape != (count,) or not np.isin(given, (-1, 0, 1)).all():
-            raise InputError(f"marks must be -1, 0 or 1 for each of {count} leaves")
-        whole = np.zeros(len(self.forest.pools.marks), np.int8)
-        whole[:count] = given
-        self.forest.pools.marks.assign(whole)
-        self._replay(marked=True)
 
     def launch(self, *, marked: bool = False, goes_on: bool = False) -> None:
         """Launch a pass, or record it within the caller's capture.
@@ -202,7 +207,7 @@ class RemeshPass:
         self._many(pool_kernels.refresh_masses, pools, carried)
         self._many(order.count_leaves, pools, self._sums)
         wp.utils.array_scan(self._sums, self._ends, inclusive=True)
-        self._many(order.list_leaves, self._ends, pools)
+        self._many(order.list_leaves, self._sums, self._ends, pools)
         self._many(order.adopt_list, self._moves, pools)
         self._many(order.rename_void, self._moves, pools)
         self._once(order.adopt_count, pools)
@@ -228,24 +233,6 @@ class RemeshPass:
         self._many(order.move_nodes, pools, self.forest.carriage.arrays, moves)
         self._many(order.rename_ends, moves, pools)
 
-    def _replay(self, *, marked: bool) -> None:
-        if self.device.is_cuda and not wp.is_conditional_graph_supported():
-            self.launch(marked=marked)
-            return
-        if marked not in self._graphs:
-            with wp.ScopedCapture(device=self.device) as capture:
-                self.launch(marked=marked)
-            self._graphs[marked] = capture.graph
-        wp.capture_launch(self._graphs[marked])
-
-    def _once(self, kernel: wp.Kernel, *arguments: Any) -> None:
-        wp.launch(kernel, dim=1, inputs=list(arguments), device=self.device)
-
-    def _many(self, kernel: wp.Kernel, *arguments: Any) -> None:
-        """Launch a kernel in which each thread loops over a stretch of the items."""
-        threads = self.forest.threads
-        wp.launch(kernel, dim=threads, inputs=[threads, *arguments], device=self.device)
-
     def _make_contents(self, lame: tuple[float, float] | tuple[str, str]) -> Contents:
         names = self.forest.carriage.names
 
@@ -259,43 +246,109 @@ class RemeshPass:
         contents.fill_column = column("fill")
         return contents
 
-    def _make_edges(self) -> refine.WantedEdges:
-        size = 1 << (2 * (self.forest.node_capacity + self.forest.threads)).bit_length()
-        edges = refine.WantedEdges()
-        edges.keys = wp.full(size, wp.int64(-1), dtype=wp.int64, device=self.device)
-        edges.born = wp.full(size, int(refine.NEVER), dtype=wp.int32, device=self.device)
-        edges.ring, edges.agreed, edges.pairs = (wp.zeros(size, dtype=wp.int32, device=self.device) for _ in range(3))
-        edges.head, edges.node = (wp.full(size, -1, dtype=wp.int32, device=self.device) for _ in range(2))
-        # Threads that add an edge at the same time may exceed the limit, but never fill the table.
-        edges.most = size // 2
-        edges.wanted = wp.empty(size, dtype=wp.int32, device=self.device)
-        return edges
 
-    def _make_blocks(self) -> refine.Blocks:
-        blocks = refine.Blocks()
-        shape = (self.forest.node_capacity, refine.KEPT)
-        blocks.of_node = wp.full(shape, int(refine.NONE), dtype=wp.int32, device=self.device)
-        blocks.latest = wp.full(shape[0], int(refine.NONE), dtype=wp.int32, device=self.device)
-        blocks.hot = wp.zeros(self.forest.capacity // int(refine.BLOCK) + 1, dtype=wp.int32, device=self.device)
-        blocks.all_hot = wp.zeros(1, dtype=wp.int32, device=self.device)
-        return blocks
+#: Up to this many leaves there is room for all of them in one cut; of more, for a quarter.
+ALL_LEAVES = 1 << 18
 
-    def _make_removal(self) -> simplify.Removal:
-        count = self.forest.node_capacity
-        removal = simplify.Removal()
-        removal.willing = wp.zeros(count, dtype=wp.int32, device=self.device)
-        removal.head = wp.full(count, -1, dtype=wp.int32, device=self.device)
-        removal.candidates = wp.empty(count, dtype=wp.int32, device=self.device)
-        return removal
 
-    def _make_moves(self) -> order.Moves:
-        moves = order.Moves()
-        nodes, threads = self.forest.node_capacity, self.forest.threads
-        moves.sums, moves.ends = (wp.zeros(2 * threads, dtype=wp.int32, device=self.device) for _ in range(2))
-        moves.holes, moves.movers, moves.forward = (
-            wp.empty(nodes, dtype=wp.int32, device=self.device) for _ in range(3)
-        )
-        return moves
+class CutPass(_Launches):
+    """Launches that cut a forest along a surface. No array of the whole body goes to the host.
+
+    Args:
+        forest: The forest to cut.
+        toughness: Energy of a cut [J/m^2], unless leaves carry "toughness".
+    """
+
+    def __init__(self, forest: DeviceForest, toughness: float = 0.0):
+        super().__init__(forest)
+        capacity, nodes = forest.capacity, forest.node_capacity
+        room = max(capacity // 4, min(capacity, ALL_LEAVES))
+        # Two leaves share a face; half of the table stays empty.
+        table = 1 << (8 * room).bit_length()
+        sizes = [(room, "stars fresh"), (4 * room, "slot other link copy pull"), (table, "keys owner")]
+        sizes += [(nodes, "mark marked keeper former_mass"), (cut_kernels.COUNTS, "counts")]
+        absent = dict.fromkeys(("slot", "other", "link", "copy", "keys", "owner"), -1)
+        cuts = self._cuts = allocated(cut_kernels.Cuts, self.device, sizes, **absent)
+        cuts.room = room
+        names = forest.carriage.names
+        cuts.toughness, cuts.toughness_column = toughness, names.index("toughness") if "toughness" in names else -1
+        cuts.names = forest.pools.tets.view(wp.int32)
+
+    def launch_cut(self, surface: Surface, *, goes_on: bool = False) -> None:
+        """Launch a cut: which faces the surface crosses, and the separation of their nodes.
+
+        Args:
+            surface: A plane or triangles.
+            goes_on: Whether it belongs to a pass that was just launched: then its counts are added to that pass's.
+        """
+        pools, carried, cuts = self.forest.pools, self.forest.carriage.arrays, self._cuts
+        self._once(cut_kernels.begin_cut, int(goes_on), pools, cuts)
+        self._many(cut_kernels.list_near, surface, carried, pools, cuts)
+        self._many(cut_kernels.cross_faces, surface, carried, pools, cuts)
+        self._launch_end(surface)
+
+    def launch_tear(self, stress: float, contents: Contents) -> None:
+        """Launch a tear: the separation of faces across which the stress [Pa] is larger.
+
+        Args:
+            stress: The bound.
+            contents: The material of leaves.
+        """
+        pools, carried, cuts = self.forest.pools, self.forest.carriage.arrays, self._cuts
+        surface = Surface()
+        surface.stress = stress
+        self._once(cut_kernels.begin_cut, 0, pools, cuts)
+        self._many(cut_kernels.list_all, pools, cuts)
+        self._many(cut_kernels.pull_faces, contents, carried, pools, cuts)
+        self._many(cut_kernels.choose_faces, surface, pools, cuts)
+        self._many(cut_kernels.tear_faces, pools, cuts)
+        self._launch_end(surface)
+
+    def launch_marks(self, surface: Surface) -> None:
+        """Launch the marks of leaves at triangles that are to be refined to their levels."""
+        self._many(cut_kernels.mark_near, surface, self.forest.carriage.arrays, self.forest.pools)
+
+    def launch_after_pass(self) -> None:
+        """Launch the separation of nodes that a pass has made on cut faces; may be recorded with the pass."""
+        pools, carried, cuts = self.forest.pools, self.forest.carriage.arrays, self._cuts
+        self._once(cut_kernels.begin_cut, 1, pools, cuts)
+        self._many(cut_kernels.mark_bisected, carried, pools, cuts)
+        self._launch_split()
+
+    @property
+    def faces(self) -> int:
+        """The number of faces that the last cut has separated."""
+        return int(self._cuts.counts.numpy()[cut_kernels.FACES])
+
+    # --- pieces ------------------------------------------------------------------------------------------------------
+
+    def _launch_end(self, surface: Surface) -> None:
+        """Launch what follows when faces have been cut."""
+        pools, carried, cuts = self.forest.pools, self.forest.carriage.arrays, self._cuts
+        self._many(cut_kernels.join_lone, pools, cuts)
+        self._many(cut_kernels.count_faces, surface, carried, pools, cuts)
+        self._launch_split()
+
+    def _launch_split(self) -> None:
+        pools, carried, cuts = self.forest.pools, self.forest.carriage.arrays, self._cuts
+        self._once(split_kernels.begin_stars, cuts)
+        self._many(split_kernels.list_stars, pools, cuts)
+        self._many(split_kernels.unite_corners, pools, cuts)
+        self._many(split_kernels.choose_keepers, pools, cuts)
+        self._many(split_kernels.copy_nodes, pools, carried, cuts)
+        self._many(split_kernels.rename_corners, pools, carried, cuts)
+        self._many(split_kernels.settle_nodes, pools, carried, cuts)
+        self._many(split_kernels.rename_ancestors, pools, cuts)
+        self._many(split_kernels.tear_ancestors, pools, cuts)
+        self._once(split_kernels.end_cut, pools, cuts)
+
+
+def plane_surface(normal: npt.ArrayLike, offset: float, *, is_deformed: bool) -> Surface:
+    """A plane of the points x with normal . x = offset [m]; normal of unit length."""
+    surface = Surface()
+    surface.is_deformed = float(is_deformed)
+    surface.normal, surface.offset = wp.vec3d(*np.asarray(normal, dtype=float)), float(offset)
+    return surface
 
 
 #: A longer step is searched for only after the stiffest element has been softer for this many passes.

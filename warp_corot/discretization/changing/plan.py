@@ -14,6 +14,7 @@ from warp_corot.discretization.elements import device_frames, edge_lengths
 from warp_corot.discretization.groups import cubes_of
 from warp_corot.discretization.plan import LeafCounts, Sharing, Units
 from warp_corot.discretization.planner import GRANULE, PlanArrays, Planner, Room
+from warp_corot.discretization.sizes import allocated
 from warp_corot.kernels.elements.cpu import rest_matrices
 from warp_corot.kernels.elements.elements import ForestElements
 from warp_corot.kernels.plan import changing as kernels
@@ -282,14 +283,10 @@ class ChangingGroups:
         _, cube_of_root = np.unique(
             cubes_of(source, source.tree.tets[: self._pools.roots]), axis=0, return_inverse=True
         )
-        groups = self._groups = kernels.Groups()
-        groups.count = self._zeros(1)
-        groups.starts, groups.size = self._zeros(most + 1), self._zeros(most + 1)
-        groups.members, groups.filled = self._zeros(most), self._zeros(most)
-        tetrahedra = len(self._pools.level)
-        groups.tally, groups.makes, groups.is_flat = (self._zeros(tetrahedra) for _ in range(3))
-        count = int(cube_of_root.max()) + 1
-        groups.cube_tally, groups.cube_makes = self._zeros(count), self._zeros(count)
+        cubes = int(cube_of_root.max()) + 1
+        sizes = [(most + 1, "starts size"), (most, "members filled"), (1, "count")]
+        sizes += [(len(self._pools.level), "tally makes is_flat"), (cubes, "cube_tally cube_makes")]
+        groups = self._groups = allocated(kernels.Groups, self.device, sizes)
         groups.cube_of_root = wp.array(cube_of_root.ravel(), dtype=wp.int32, device=self.device)
         self.starts, self.members, self.live = groups.starts, groups.members, groups.count
 
@@ -309,9 +306,6 @@ class ChangingGroups:
     @property
     def _pools(self) -> Any:
         return self._forest.pools
-
-    def _zeros(self, count: int) -> wp.array:
-        return wp.zeros(count, dtype=wp.int32, device=self.device)
 
     def _launch(self, kernel: wp.Kernel, dim: int, *arguments: Any) -> None:
         wp.launch(kernel, dim=dim, inputs=[*arguments, self._groups], device=self.device)

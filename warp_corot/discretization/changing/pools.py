@@ -338,24 +338,6 @@ class DeviceForest:
         """Nodes that leaves name."""
         return self.count(kernels.NODE_TOP)
 
-    @property
-    def free_nodes(self) -> int:
-        return self.node_capacity - self.virtual_count - self.node_count
-
-    @property
-    def free_leaves(self) -> int:
-        """Number of further leaves for which there is room."""
-        return self.count(kernels.FREE_PAIRS)
-
-    @property
-    def is_full(self) -> bool:
-        """Whether a refinement was ever left out because the pools were full."""
-        return bool(self.count(kernels.FULL))
-
-    def counts(self) -> PassCounts:
-        """The counts after the last pass, by one readback."""
-        return PassCounts.of(self.pools.counts.numpy())
-
     def count(self, which: int) -> int:
         """One of the counts of ``kernels.remesh.pools``."""
         return int(self.pools.counts.numpy()[which])

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from warp_corot.discretization.sizes import padded
+from warp_corot.discretization.sizes import allocated, padded
 from warp_corot.errors import InputError
 from warp_corot.kernels.remesh.derived import bind_points
 from warp_corot.kernels.remesh.pools import MEAN, NO_ROW, SINKS, Carried, Pools
@@ -38,7 +38,7 @@ class Carriage:
 
     A new node is the midpoint of its deformed edge, so that children have their parent's deformation gradient. Mass is
     lumped, a quarter of each leaf's at its nodes, and carries its momentum along; momentum that a held node cannot take
-    up is counted in ``support_impulse``. A node between two held ones is held. Loads stay where they are; half of a
+    up is counted in ``arrays.impulse``. A node between two held ones is held. Loads stay where they are; half of a
     removed node's load goes to each end of its edge. Children have their parent's density and values; a parent has its
     children's mean, or the value by the rule of its ``Column``.
 
@@ -76,7 +76,8 @@ class Carriage:
             columns["fill"] = Column(source.fill)
         self.names, self.number_names = tuple(columns), tuple(numbers)
         per_leaf = _of_leaves("density", density, len(leaves)) * fill
-        arrays = Carried()
+        zeros = "u v load reaction snap held inverse_mass row gained_mass gained_momentum gain_count gainers"
+        arrays = allocated(Carried, device, [(self._nodes, zeros), (1, "cut_area impulse")], row=int(NO_ROW))
         arrays.origin = wp.vec3d(*source.origin)
         arrays.spacing = lattice_spacing(source.cell_size)
         volume = volume_shares(np.arange(MAX_LEVEL + 1)) * source.cell_size**3
@@ -95,33 +96,17 @@ class Carriage:
         np.add.at(masses, source.tets, (0.25 * per_leaf * volume[source.levels])[:, None])
         arrays.mass = wp.array(masses, dtype=wp.float64, device=self.device)
         arrays.mass32 = wp.array(masses, dtype=wp.float32, device=self.device)
-        arrays.inverse_mass = wp.zeros(self._nodes, dtype=wp.float32, device=self.device)
-        for name in ("u", "v", "load", "reaction", "snap"):
-            setattr(arrays, name, wp.zeros(self._nodes, dtype=wp.vec4, device=self.device))
         rest = np.zeros((self._nodes, 4), np.float32)
         rest[: self._first_nodes] = padded(source.points)
         if source.snap is not None:
             arrays.snap[: self._first_nodes].assign(padded(source.snap[: self._first_nodes]))
         arrays.rest = wp.array(rest, dtype=wp.vec4, device=self.device)
-        arrays.held = wp.zeros(self._nodes, dtype=wp.uint8, device=self.device)
-        arrays.row = wp.full(self._nodes, int(NO_ROW), dtype=wp.int32, device=self.device)
-        arrays.gained_mass = wp.zeros(self._nodes, dtype=wp.float64, device=self.device)
-        arrays.gained_momentum = wp.zeros(self._nodes, dtype=wp.vec3d, device=self.device)
-        arrays.gain_count = wp.zeros(self._nodes, dtype=wp.int32, device=self.device)
-        arrays.gainers = wp.empty(self._nodes, dtype=wp.int32, device=self.device)
-        arrays.cut_area = wp.zeros(1, dtype=wp.float64, device=self.device)
-        arrays.impulse = wp.zeros(1, dtype=wp.vec3d, device=self.device)
         self.arrays = arrays
         self.update_inverse_mass()
 
     def values(self, name: str) -> npt.NDArray[np.float32]:
         """A quantity at all places for tetrahedra; only the values of leaves count."""
         return self.arrays.values.numpy()[:, self.names.index(name)]
-
-    @property
-    def support_impulse(self) -> npt.NDArray[np.float64]:
-        """Impulse of the supports in all passes, as mass came to and left held nodes [N s], float64 [3]."""
-        return self.arrays.impulse.numpy()[0]
 
     def update_inverse_mass(self) -> None:
         """Find the inverse masses again, which are zero where nodes are held."""

@@ -25,8 +25,7 @@ from warp_corot.materials.anisotropic import FibreReinforced, Orthotropic, Trans
 from warp_corot.materials.isotropic import Isotropic
 from warp_corot.mesh import TetForest, TetMesh
 from warp_corot.mesh.surfaces.marching import Detail
-from warp_corot.remesh.carried_material import Keys
-from warp_corot.remesh.conditions import Row
+from warp_corot.remesh.conditions import Keys
 from warp_corot.remesh.remeshing import OnlineRemesh
 from warp_corot.simulation.simulation import Simulation
 from warp_corot.solvers import INTEGRATORS
@@ -47,7 +46,7 @@ INSTANCE = ("kind of", "values")
 
 def kinds() -> dict[str, Any]:
     """The dataclasses that checkpoints hold, by name: laws and integrators that are listed, materials, and parts."""
-    listed: list[Any] = [*MODELS.values(), *INTEGRATORS.values(), Contact, Detail, Findings, Keys, Row]
+    listed: list[Any] = [*MODELS.values(), *INTEGRATORS.values(), Contact, Detail, Findings, Keys]
     listed += [Isotropic, TransverselyIsotropic, Orthotropic, FibreReinforced]
     return {kind.__name__: kind for kind in listed}
 

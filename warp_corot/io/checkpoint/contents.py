@@ -273,11 +273,11 @@ def pack_changing(changing: Changing) -> dict[str, Any]:
         "parameters": options.parameters,
         "near": None if options.near is None else options.near.place_among_obstacles()[1],
         "conditions": conditions.kept,
-        "rows": [[k, row] for k, row in conditions.keyframes.rows.items()],
+        "rows": conditions.keyframes.keys,
         "between": [[*ends, row] for ends, row in conditions.keyframes.between.items()],
         "loads": changing.body.conditions.has_loads,
         "activation": changing.body.discretization.has_activation,
-        "activation_rows": conditions.activation.keys,
+        "activation_rows": conditions.activation.keyframes.keys,
         "at_beginning": conditions.of_present_mesh,
         "survey": changing.survey.last,
         "initial": _pack_snapshot(forest.remembered),
@@ -292,18 +292,17 @@ def unpack_changing(changing: Changing, packed: dict[str, Any]) -> None:
     _unpacked_snapshot(kept_in, packed["initial"]).restore(*kept_in)
     forest.remember()
     _unpacked_snapshot(kept_in, packed["present"]).restore(*kept_in)
-    keyframes.rows = dict(packed["rows"])
+    keyframes.keys = packed["rows"]
     keyframes.between = {(a, b): row for a, b, row in packed["between"]}
     if packed["activation"]:
         _ = body.activation  # made on first use
     changing.renew()
     activation = changing.conditions.activation
-    activation.keys = packed["activation_rows"]
-    if activation.keys:
-        activation.serve()
+    activation.keyframes.keys = packed["activation_rows"]
+    activation.follow()
     rows = forest.carriage.arrays.row[: body.node_count].numpy()
     nodes = np.flatnonzero(rows >= 0).astype(np.int32)
-    body.conditions.set_trajectories(keyframes.trajectories(nodes, rows[nodes], body.device))
+    body.conditions.set_trajectories(keyframes.make(nodes, rows[nodes], wp.vec3, body.device))
     kept = {
         name: wp.array(values, dtype=KEPT[name], device=body.device) for name, values in packed["conditions"].items()
     }

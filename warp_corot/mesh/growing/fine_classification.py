@@ -196,7 +196,7 @@ class Resolved:
             shares[rough], nearest = _sampled_shares(grown, leaves[rough], cell_size, domain, shares[rough])
             held = shares * self.volume[leaves]
             if held[bare].sum() > OF_WALLS * held.sum():
-                corners = grown.lattice[tree.tets[leaves[bare]]] * lattice_spacing(cell_size) + np.asarray(grown.origin)
+                corners = self.points(tree.tets[leaves[bare]])
                 shares[bare] = wall_shares(corners, nearest[bare[rough]], shares[bare], domain)
         self.leaves, self.shares = leaves[shares > 0.0], shares[shares > 0.0]
         held = np.zeros(len(tree.level))
@@ -273,8 +273,8 @@ class Resolved:
         grown, found = self.grown, np.full(len(self.held), np.inf)
         cut = self.leaves[self.shares < 1.0]
         if len(cut):
-            tets, spacing = grown.tree.tets[cut], lattice_spacing(self.cell_size)
-            x, inward = surface_points(grown.lattice[tets], grown.phi[tets], np.asarray(grown.origin), spacing)
+            tets = grown.tree.tets[cut]
+            x, inward = surface_points(self.points(tets), grown.phi[tets])
             found[cut] = domain.thickness(x, inward, FARTHER * layers * self.cell_size)
         return self.smallest(found)
 

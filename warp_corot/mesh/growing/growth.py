@@ -12,10 +12,11 @@ import numpy as np
 import warp as wp
 
 from warp_corot.errors import InputError
+from warp_corot.inputs.arguments import forwards
 from warp_corot.inputs.cpu_threads import launch_side_by_side
 from warp_corot.kernels.meshing import growth as kernels
 from warp_corot.mesh.bisection import path_tetrahedra
-from warp_corot.mesh.growing.refinement_criteria import Judge, Wishes, with_room
+from warp_corot.mesh.growing.refinement_criteria import Judge, Wishes
 from warp_corot.mesh.lattice import LATTICE_BITS, MAX_CELLS, MAX_LEVEL, volume_shares
 from warp_corot.mesh.surfaces.bound import leaves_at
 from warp_corot.mesh.tree import LIVE, Tree
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
 ROOM = 2
 
 
+@forwards("forest", "tets", "level", "parent", "first_child", "wished", "bound", "lattice", "ends", "active")
 class Growth:
     """Tetrahedra, nodes and the edges whose midpoints the nodes are, bisected in rounds.
 
@@ -38,23 +40,37 @@ class Growth:
         ends: int32 [n, 2].
         tree: The first tetrahedra.
         device: The device of the computation.
+
+    Attributes:
+        forest: ``kernels.meshing.growth.Forest``, whose arrays of elements and nodes are attributes, too.
     """
+
+    tets: wp.array
+    level: wp.array
+    parent: wp.array
+    first_child: wp.array
+    wished: wp.array
+    bound: wp.array
+    lattice: wp.array
+    ends: wp.array
+    active: wp.array
 
     def __init__(self, lattice: np.ndarray, ends: np.ndarray, tree: Tree, device: wp.Device):
         self.device = device
         self.element_count = len(tree.level)
         self.node_count = len(lattice)
-        self.tets = self._on_device(tree.tets, wp.vec4i)
-        self.level = self._on_device(tree.level, wp.int32)
-        self.parent = self._on_device(tree.parent, wp.int32)
-        self.first_child = self._on_device(tree.first_child, wp.int32)
-        self.wished = wp.zeros(self.element_count, dtype=wp.uint8, device=device)
-        self.bound = wp.zeros(self.element_count, dtype=wp.uint8, device=device)
-        self.lattice = self._on_device(lattice, wp.vec3i)
-        self.ends = self._on_device(ends, wp.vec2i)
-        self.active = self._on_device(ends[:, 0] >= 0, wp.uint8)
-        self.touched = wp.zeros(self.node_count, dtype=wp.uint8, device=device)
-        self._counts = self._on_device([self.node_count, 0], wp.int32)
+        forest = self.forest = kernels.Forest()
+        forest.tets = self._on_device(tree.tets, wp.vec4i)
+        forest.level = self._on_device(tree.level, wp.int32)
+        forest.parent = self._on_device(tree.parent, wp.int32)
+        forest.first_child = self._on_device(tree.first_child, wp.int32)
+        forest.wished, forest.bound = (wp.zeros(self.element_count, wp.uint8, device=device) for _ in range(2))
+        forest.lattice = self._on_device(lattice, wp.vec3i)
+        forest.ends = self._on_device(ends, wp.vec2i)
+        forest.active = self._on_device(ends[:, 0] >= 0, wp.uint8)
+        forest.touched = wp.zeros(self.node_count, dtype=wp.uint8, device=device)
+        forest.counts = self._on_device([self.node_count, 0], wp.int32)
+        forest.need, forest.phi = (wp.empty(0, dtype=wp.float32, device=device) for _ in range(2))
         self._make_table()
 
     # --- rounds ------------------------------------------------------------------------------------------------------
@@ -70,9 +86,8 @@ class Growth:
         slots = self.insert_edges(elements, of_refinement=True)
         self._activate(slots)
         base, count = self.element_count, self.element_count + 2 * len(elements)
-        self._make_room(count, "tets", "level", "parent", "first_child", "wished", "bound")
-        outputs = [self.tets, self.level, self.parent, self.first_child, self.bound]
-        self.launch(kernels.bisect, len(elements), [elements, slots, self._values, base], outputs)
+        self.make_room(count, "tets", "level", "parent", "first_child", "wished", "bound")
+        self.launch(kernels.bisect, len(elements), elements, slots, base, self.forest)
         self.element_count = count
 
     def bisect_edges(self, pairs: np.ndarray) -> np.ndarray:
@@ -85,21 +100,16 @@ class Growth:
             return np.zeros(0, np.int32)
         slots = self.insert_pairs(self._on_device(pairs, wp.vec2i))
         self._activate(slots)
-        middles: np.ndarray = self._values.numpy()[slots.numpy()]
+        middles: np.ndarray = self.forest.values.numpy()[slots.numpy()]
         return middles
 
     def insert_edges(self, elements: wp.array, *, of_refinement: bool) -> wp.array:
         """Ensure that the elements' refinement edges, or all their edges, have midpoints; return slots in the table [n]
         or [6n].
         """
-        count = len(elements) * (1 if of_refinement else 6)
-        pairs = wp.empty(count, dtype=wp.vec2i, device=self.device)
-        if of_refinement:
-            self.launch(
-                kernels.refinement_edges, len(elements), [elements, self.tets, self.level], [self._counts, pairs]
-            )
-        else:
-            self.launch(kernels.all_edges, len(elements), [elements, self.tets], [pairs])
+        kernel, count = (kernels.refinement_edges, 1) if of_refinement else (kernels.all_edges, 6)
+        pairs = wp.empty(count * len(elements), dtype=wp.vec2i, device=self.device)
+        self.launch(kernel, len(elements), elements, self.forest, pairs)
         return self.insert_pairs(pairs)
 
     def insert_pairs(self, pairs: wp.array) -> wp.array:
@@ -113,19 +123,9 @@ class Growth:
             moved = self._reserve_nodes(stop - start)
             if moved and start:
                 return self.insert_pairs(pairs)
-            table = [self.lattice, self.ends, self._keys, self._values, self._counts]
-            self.launch(kernels.insert_midpoints, stop - start, [pairs[start:stop], *table], [slots[start:stop]])
+            self.launch(kernels.insert_midpoints, stop - start, pairs[start:stop], self.forest, slots[start:stop])
             self._read_counts()
         return slots
-
-    def midpoints(self, slots: wp.array) -> list[wp.array]:
-        """The arrays from which kernels read the midpoints of slots."""
-        return [slots, self._values]
-
-    @property
-    def table(self) -> list[wp.array]:
-        """Keys and values of the hash table from edges to their midpoints."""
-        return [self._keys, self._values]
 
     def hanging(self, first_new: int = 0) -> wp.array:
         """Leaves that must be bisected, by a wish or an active midpoint on an edge; ascending.
@@ -133,15 +133,13 @@ class Growth:
         Before ``first_new`` only those whose edges got an active midpoint since the last call.
         """
         flags = wp.empty(self.element_count, dtype=wp.int32, device=self.device)
-        of_elements = [self.tets, self.first_child, self.wished, self.bound]
-        shared = [self._keys, self._values, self.active, self.touched]
         launch_side_by_side(
             kernels.flag_hanging,
             self.element_count,
-            lambda own: ([*map(own, of_elements), *shared, own(first_new)], [own(flags)]),
+            lambda own: ([-own(0), first_new, self.forest], [flags]),
             self.device,
         )
-        self.touched.zero_()
+        self.forest.touched.zero_()
         return self.flagged(flags)
 
     def flagged(self, flags: wp.array, first: int = 0) -> wp.array:
@@ -171,35 +169,40 @@ class Growth:
         count = self.element_count
         return Tree(*(a[:count].numpy() for a in (self.tets, self.level, self.parent, self.first_child)))
 
-    def launch(self, kernel: wp.Kernel, count: int, inputs: list[Any], outputs: list[Any]) -> None:
-        wp.launch(kernel, dim=count, inputs=inputs, outputs=outputs, device=self.device)
+    def launch(self, kernel: wp.Kernel, count: int, *arguments: Any) -> None:
+        wp.launch(kernel, count, list(arguments), device=self.device)
 
     # --- room ------------------------------------------------------------------------------------------------------
 
+    def make_room(self, count: int, *names: str) -> None:
+        """Make these arrays of the forest at least so long; new places are zero."""
+        for name in names:
+            array = getattr(self.forest, name)
+            if count > len(array):
+                longer = wp.zeros(max(count, 3 * len(array) // 2), dtype=array.dtype, device=self.device)
+                wp.copy(longer, array, count=len(array))
+                setattr(self.forest, name, longer)
+
     def _activate(self, slots: wp.array) -> None:
-        self.launch(kernels.activate, len(slots), [slots, self._values, self.ends], [self.active, self.touched])
+        self.launch(kernels.activate, len(slots), slots, self.forest)
 
     def _reserve_nodes(self, more: int) -> bool:
         """Reserve room for more nodes; return whether the table's slots have changed."""
         count = self.node_count + more
-        self._make_room(count, "lattice", "ends", "active", "touched")
-        if ROOM * count <= len(self._keys):
+        self.make_room(count, "lattice", "ends", "active", "touched")
+        if ROOM * count <= len(self.forest.keys):
             return False
         self._make_table(count)
         return True
 
     def _make_table(self, count: int = 0) -> None:
         size = 1 << max(int(2 * ROOM * max(count, self.node_count)).bit_length(), 10)
-        self._keys = wp.full(size, wp.int64(-1), dtype=wp.int64, device=self.device)
-        self._values = wp.full(size, -1, dtype=wp.int32, device=self.device)
-        self.launch(kernels.fill_table, self.node_count, [self.ends], [self._keys, self._values])
-
-    def _make_room(self, count: int, *names: str) -> None:
-        for name in names:
-            setattr(self, name, with_room(getattr(self, name), count))
+        self.forest.keys = wp.full(size, wp.int64(-1), dtype=wp.int64, device=self.device)
+        self.forest.values = wp.full(size, -1, dtype=wp.int32, device=self.device)
+        self.launch(kernels.fill_table, self.node_count, self.forest)
 
     def _read_counts(self) -> None:
-        counts = self._counts.numpy()
+        counts = self.forest.counts.numpy()
         self.node_count = int(counts[kernels.NODES])
         if counts[kernels.DEEPEST] >= MAX_LEVEL:
             raise InputError(f"a tetrahedron is already at level {MAX_LEVEL}, the deepest that the lattice can hold")
@@ -381,7 +384,7 @@ class Growing:
         """
         growth, judge = self.growth, self.judge
         lattice, ends = growth.nodes()
-        phi, need = judge.phi[: growth.node_count].numpy(), judge.need[: growth.element_count].numpy()
+        phi, need = growth.forest.phi[: growth.node_count].numpy(), judge.needs()
         tree = growth.tree()
         wished = tree.first_child if wished is None else wished
         return Grown(self.cells, self.origin, lattice, ends, tree, phi, need, wished, growth, judge.max_level)
@@ -394,7 +397,7 @@ class Growing:
         room = max((self.room - growth.element_count) // 2, 0)
         if len(wished) <= room:
             return wished
-        need = judge.need[: growth.element_count].numpy()[wished.numpy()]
+        need = judge.needs()[wished.numpy()]
         least = np.partition(need, len(need) - room - 1)[len(need) - room - 1]
         judge.tolerances = np.maximum(judge.tolerances, least)
         growth.wished.zero_()

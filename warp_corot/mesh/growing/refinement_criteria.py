@@ -65,8 +65,6 @@ class Judge:
     bisected.
 
     Attributes:
-        phi: Values at the nodes, with spare room.
-        need: The error of each element if it were not bisected [m], with spare room.
         tolerances: The allowed error of each level [m], float32.
         closest: The values to which the tolerances may be lowered later [m], float32.
         max_level: The level below which nothing is bisected.
@@ -78,18 +76,17 @@ class Judge:
     def __init__(self, domain: Domain, growth: Growth, cells: Any, origin: Any, cell_size: float, wishes: Wishes):
         self.domain, self.growth, self.wishes, self.device = domain, growth, wishes, growth.device
         self.top = wp.vec3i(*(n << LATTICE_BITS for n in cells))
-        self.origin = wp.vec3d(*origin)
-        self.spacing = lattice_spacing(cell_size)
         level = np.arange(MAX_LEVEL + 1)
         h = cell_size * 0.5 ** (level // 3)
-        self.circumradius = wp.array(h * np.array(CIRCUMRADIUS)[level % 3], dtype=wp.float32, device=self.device)
-        self.edges = wp.array(h[:, None] * np.array(EDGE_LENGTHS)[level % 3], dtype=wp.float32, device=self.device)
+        forest = self._forest = growth.forest
+        forest.origin, forest.spacing = wp.vec3d(*origin), lattice_spacing(cell_size)
+        forest.lipschitz = float(domain.lipschitz)
+        forest.circumradius = self._on_device(h * np.array(CIRCUMRADIUS)[level % 3])
+        forest.edges = self._on_device(h[:, None] * np.array(EDGE_LENGTHS)[level % 3])
         #: The uncertainty of a value from float32 coordinates.
         reach = float(np.abs(np.asarray(origin)).max() + max(cells) * cell_size)
         self.noise = float(domain.lipschitz) * reach * 2.0**-22
-        self.phi = wp.empty(0, dtype=wp.float32, device=self.device)
         self.evaluated = 0
-        self.need = wp.empty(0, dtype=wp.float32, device=self.device)
         self.tolerances = np.full(MAX_LEVEL + 1, wishes.surface_error, np.float32)
         self.closest = self.tolerances
         self.lengths = h
@@ -103,23 +100,21 @@ class Judge:
         count = growth.node_count - first
         if not count:
             return
-        self.phi = with_room(self.phi, growth.node_count)
+        growth.make_room(growth.node_count, "phi")
         points = wp.empty(count, dtype=wp.vec3, device=self.device)
-        growth.launch(kernels.node_points, count, [growth.lattice, first, self.origin, self.spacing], [points])
-        found = self.domain.phi(points)
-        growth.launch(kernels.take_values, count, [found, growth.lattice, first, self.top, self.noise], [self.phi])
+        growth.launch(kernels.node_points, count, first, self._forest, points)
+        growth.launch(kernels.take_values, count, self.domain.phi(points), first, self.top, self.noise, self._forest)
         self.evaluated = growth.node_count
 
     def wished(self, first: int) -> wp.array:
         """Find out which elements from ``first`` on are outside, and which must be bisected."""
         growth, wishes = self.growth, self.wishes
         self.evaluate()
-        self.need = with_room(self.need, growth.element_count)
+        growth.make_room(growth.element_count, "need")
         count = growth.element_count - first
         states = wp.empty(count, dtype=wp.int32, device=self.device)
-        inputs = [first, growth.tets, growth.level, self.phi, self.circumradius, self.edges]
-        inputs += [float(self.domain.lipschitz), wishes.min_level, self.max_level]
-        growth.launch(kernels.judge_by_corners, count, inputs, [growth.first_child, states, self.need])
+        levels = wishes.min_level, self.max_level
+        growth.launch(kernels.judge_by_corners, count, first, *levels, self._forest, states)
         self._judge_all(first, states)
         if not self.limited:
             growth.wished[first : growth.element_count].assign(states.numpy() == int(kernels.SPLIT))
@@ -127,7 +122,7 @@ class Judge:
 
     def off(self) -> wp.array:
         """Leaves whose errors exceed the present tolerances."""
-        level, leaf, need = self._now(self.growth.level), self._now(self.growth.first_child), self._now(self.need)
+        level, leaf, need = self._now("level"), self._now("first_child"), self.needs()
         found = np.flatnonzero((leaf == LIVE) & (level < self.max_level) & (need > self.tolerances[level]))
         return wp.array(found, dtype=wp.int32, device=self.device)
 
@@ -139,16 +134,16 @@ class Judge:
             levels: The number of levels.
             error: The smallest tolerance of the surface there, as a fraction of an element's edge.
         """
-        growth, before = self.growth, self.max_level
+        before = self.max_level
         self.limited = self.closer = True
         self.max_level = min(before + levels, MAX_LEVEL)
         self.tolerances = np.maximum(self.tolerances, error * self.lengths).astype(np.float32)
         self.closest = self.tolerances
-        level, parent = self._now(growth.level), self._now(growth.parent)
-        size = self.circumradius.numpy()[level]
-        rough = (parent < 0) | (self._now(self.need)[parent] > np.float32(ROUGH) * size)
-        chosen = np.flatnonzero((self._now(growth.first_child) == LIVE) & (level >= before) & rough)
-        highest = self.phi.numpy()[self._now(growth.tets)[chosen]].max(axis=1)
+        level, parent = self._now("level"), self._now("parent")
+        size = self._forest.circumradius.numpy()[level]
+        rough = (parent < 0) | (self.needs()[parent] > np.float32(ROUGH) * size)
+        chosen = np.flatnonzero((self._now("first_child") == LIVE) & (level >= before) & rough)
+        highest = self._forest.phi.numpy()[self._now("tets")[chosen]].max(axis=1)
         states = np.full(len(level), kernels.LEFT, np.int32)
         states[chosen[highest >= np.float32(-self.domain.lipschitz) * size[chosen]]] = kernels.OPEN
         on_device = wp.array(states, dtype=wp.int32, device=self.device)
@@ -157,17 +152,27 @@ class Judge:
 
     def holding(self) -> int:
         """Number of leaves with a corner inside."""
-        tets = self._now(self.growth.tets)[self._now(self.growth.first_child) == LIVE]
-        return int(np.count_nonzero((self.phi.numpy()[tets] < 0).any(axis=1)))
+        tets = self._now("tets")[self._now("first_child") == LIVE]
+        return int(np.count_nonzero((self._forest.phi.numpy()[tets] < 0).any(axis=1)))
 
     def of_state(self, states: wp.array, state: int, first: int) -> wp.array:
         """The elements, counted from ``first``, that have a state."""
         found = np.flatnonzero(states.numpy() == int(state)) + first
         return wp.array(found, dtype=wp.int32, device=self.device)
 
-    def _now(self, array: wp.array) -> np.ndarray:
-        """The values of all present elements."""
-        return array[: self.growth.element_count].numpy()
+    def needs(self) -> np.ndarray:
+        """The error of each element if it were not bisected [m], float32."""
+        return self._now("need")
+
+    def _now(self, name: str, first: int = 0) -> np.ndarray:
+        """What elements from ``first`` on have in an array of the forest."""
+        return getattr(self._forest, name)[first : self.growth.element_count].numpy()
+
+    def _raise_needs(self, elements: np.ndarray, least: np.ndarray) -> None:
+        """Let elements have at least these needs."""
+        needs = self._forest.need.numpy()
+        needs[elements] = np.maximum(needs[elements], least)
+        self._forest.need.assign(needs)
 
     def _judge_all(self, first: int, states: wp.array) -> None:
         self.judge_surface(first, states)
@@ -178,8 +183,8 @@ class Judge:
         """For elements that corners do not decide: compare with the linear interpolant at midpoints, then at one more
         point.
         """
-        growth, lipschitz = self.growth, float(self.domain.lipschitz)
-        limits = [self._on_device(self.tolerances), self._on_device(self.closest)]
+        growth, forest = self.growth, self._forest
+        forest.tolerances, forest.closest = self._on_device(self.tolerances), self._on_device(self.closest)
         elements = self.of_state(states, kernels.OPEN, first)
         count = len(elements)
         if not count:
@@ -189,56 +194,42 @@ class Judge:
         unsure = wp.empty(count, dtype=wp.int32, device=self.device)
         probes = wp.empty(count, dtype=wp.vec3, device=self.device)
         expected, deviations = (wp.empty(count, dtype=wp.float32, device=self.device) for _ in range(2))
-        (_, values), outputs = growth.midpoints(slots), [growth.first_child, states, self.need]
-        shared = [values, growth.tets, growth.level, self.phi, growth.lattice]
-        shared += [self.origin, self.spacing, self.circumradius, lipschitz, *limits]
-
-        six = slots[: 6 * count].reshape((count, 6))
+        outputs = [states, unsure, probes, expected, deviations]
         launch_side_by_side(
             kernels.judge_by_edges,
             count,
-            lambda own: (
-                [own(elements), first, own(six).flatten(), *shared],
-                [*outputs, *map(own, (unsure, probes, expected, deviations))],
-            ),
+            lambda own: ([-own(0), elements, first, slots, forest], outputs),
             self.device,
         )
         chosen = growth.flagged(unsure)
         if len(chosen):
             found = self.domain.phi(probes[chosen].contiguous())
-            inputs = [chosen, elements, first, found, expected, deviations, growth.tets, growth.level, self.phi]
-            inputs += [growth.lattice, self.spacing, lipschitz, limits[0]]
-            growth.launch(kernels.judge_by_probes, len(chosen), inputs, [states, self.need])
+            inputs = [chosen, elements, first, found, expected, deviations, forest, states]
+            growth.launch(kernels.judge_by_probes, len(chosen), *inputs)
 
     def judge_thickness(self, first: int, states: wp.array) -> None:
         """Mark elements where the body, or a gap between its pieces, is thinner than a few elements."""
-        wishes, growth, domain = self.wishes, self.growth, self.domain
+        wishes, domain = self.wishes, self.domain
         if not wishes.layers or not len(states):
             return
-        state = states.numpy()
-        level = growth.level[first : growth.element_count].numpy()
-        leaf = growth.first_child[first : growth.element_count].numpy()
         # Without a limit on their number, elements are not finer than the rest for this reason.
-        deepest = wishes.thin_level if self.closer else wishes.max_level
-        chosen = np.flatnonzero((state == kernels.DONE) & (leaf == LIVE) & (level < deepest))
+        state, chosen, level, tets = self._undecided(first, states, wishes.thin_level if self.closer else None)
         # Thickness is accurate at the surface; gaps are only estimated, so any ray will do.
-        known = self.need[first : growth.element_count].numpy()[chosen] <= self.closest[level[chosen]]
-        if not domain.has_pieces:
-            chosen, known = chosen[known], known[known]
-        tets = growth.tets[first : growth.element_count].numpy()[chosen]
-        phi = self.phi.numpy()[tets]
+        known = self._now("need", first)[chosen] <= self.closest[level]
+        phi = self._forest.phi.numpy()[tets]
         crossed = (phi < 0).any(axis=1) & (phi >= 0).any(axis=1)
-        chosen, tets, phi, known = chosen[crossed], tets[crossed], phi[crossed], known[crossed]
+        crossed &= known | domain.has_pieces
+        chosen, level, tets, phi, known = (each[crossed] for each in (chosen, level, tets, phi, known))
         if not len(chosen):
             return
-        x, inward = surface_points(growth.lattice.numpy()[tets], phi, np.asarray(self.origin), self.spacing)
+        x, inward = surface_points(self._places(tets), phi)
         # By volume: a cube's edge halves in three levels.
-        length = self.lengths[0] * 0.5 ** (level[chosen] / 3.0)
+        length = self.lengths[0] * 0.5 ** (level / 3.0)
         reach = FARTHER * wishes.layers * float(length.max())
         thin = known & (wishes.layers * length > domain.thickness(x, inward, reach))
         thin &= THIN_NEED * length > self.thin_tolerance
         need = np.where(thin, THIN_NEED * length, 0.0)
-        limits = np.maximum(self.tolerances[level[chosen]], self.thin_tolerance) if self.limited else 0.0
+        limits = np.maximum(self.tolerances[level], self.thin_tolerance) if self.limited else 0.0
         wanted = THIN_NEED * length > limits
         split = thin & wanted
         if domain.has_pieces:
@@ -249,26 +240,19 @@ class Judge:
             split |= near & (wanted | (not self.closer))
         state[chosen[split]] = kernels.SPLIT
         states.assign(state)
-        needs = self.need.numpy()
-        needs[first + chosen] = np.maximum(needs[first + chosen], need)
-        self.need.assign(needs)
+        self._raise_needs(first + chosen, need)
 
     def judge_fields(self, first: int, states: wp.array) -> None:
         """Mark elements by labels and the user's fields, evaluated at corners and centroids."""
         wishes, domain = self.wishes, self.domain
         if not (domain.label_names or wishes.refine_where is not None or wishes.field is not None):
             return
-        growth = self.growth
-        state = states.numpy()
-        leaf = growth.first_child[first : growth.element_count].numpy()
-        level = growth.level[first : growth.element_count].numpy()
-        chosen = np.flatnonzero((state == kernels.DONE) & (leaf == LIVE) & (level < wishes.max_level))
+        state, chosen, level, tets = self._undecided(first, states)
         if not len(chosen):
             return
-        tets = growth.tets[first : growth.element_count].numpy()[chosen]
         nodes, corners = np.unique(tets, return_inverse=True)
         corners = corners.reshape(-1, 4)
-        at_nodes = np.asarray(self.origin) + growth.lattice[: growth.node_count].numpy()[nodes] * self.spacing
+        at_nodes = self._places(nodes)
         at_middle = at_nodes[corners].mean(axis=1)
 
         def sampled(function: Callable[[np.ndarray], Any]) -> np.ndarray:
@@ -282,49 +266,48 @@ class Judge:
         need = np.where(must, kernels.MUST, 0.0).astype(np.float32)
         if domain.label_names:
             mixed = np.ptp(sampled(lambda x: domain.labels_at(x, nearest=True)), axis=1) > 0
-            need[mixed] = np.maximum(need[mixed], LABEL_NEED * self.lengths[level[chosen[mixed]]])
-        split = need > (self.tolerances[level[chosen]] if self.limited else 0.0)
-        needs = self.need.numpy()
-        needs[first + chosen] = np.maximum(needs[first + chosen], need)
-        self.need.assign(needs)
+            need[mixed] = np.maximum(need[mixed], LABEL_NEED * self.lengths[level[mixed]])
+        split = need > (self.tolerances[level] if self.limited else 0.0)
+        self._raise_needs(first + chosen, need)
         state[chosen[split]] = kernels.SPLIT
         states.assign(state)
 
-    def _on_device(self, tolerances: np.ndarray) -> wp.array:
-        return wp.array(tolerances, dtype=wp.float32, device=self.device)
+    def _undecided(
+        self, first: int, states: wp.array, deepest: int | None = None
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """The states of elements from ``first`` on, the places of those leaves among them that are not bisected yet and
+        may be, down to a level, and the levels and nodes of these."""
+        state, level = states.numpy(), self._now("level", first)
+        may = level < (self.wishes.max_level if deepest is None else deepest)
+        chosen = np.flatnonzero((state == kernels.DONE) & (self._now("first_child", first) == LIVE) & may)
+        return state, chosen, level[chosen], self._now("tets", first)[chosen]
+
+    def _places(self, nodes: np.ndarray) -> np.ndarray:
+        """The places of lattice points [m], float64 [..., 3]."""
+        return np.asarray(self._forest.origin) + self.growth.lattice.numpy()[nodes] * self._forest.spacing
+
+    def _on_device(self, numbers: np.ndarray) -> wp.array:
+        return wp.array(numbers, dtype=wp.float32, device=self.device)
 
 
-def surface_points(
-    corners: np.ndarray, phi: np.ndarray, origin: np.ndarray, spacing: float
-) -> tuple[np.ndarray, np.ndarray]:
+def surface_points(corners: np.ndarray, phi: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """A point where the linear interpolant is zero, or nearly, in elements, and the unit vector inwards there, float64
     [n, 3].
 
     The search goes from the middle along the gradient, but no farther than the longest edge at the first corner.
 
     Args:
-        corners: Lattice points of the elements' nodes [n, 4, 3].
+        corners: Of the elements [m], [n, 4, 3].
         phi: Values there [n, 4].
-        origin: Where the lattice begins [m].
-        spacing: One of its intervals [m].
     """
     values = phi.astype(np.float64)
-    edges = spacing * (corners[:, 1:] - corners[:, :1])
+    edges = corners[:, 1:] - corners[:, :1]
     gradient = np.linalg.solve(edges, (values[:, 1:] - values[:, :1])[..., None])[..., 0]
     slope, longest = np.linalg.norm(gradient, axis=1), np.linalg.norm(edges, axis=2).max(axis=1)
     along = -gradient / np.maximum(slope, 1e-30)[:, None]
     step = np.divide(values.mean(axis=1), slope, out=np.zeros(len(slope)), where=slope > 0.0)
     step = np.clip(step, -longest, longest)[:, None]
-    return origin + spacing * corners.mean(axis=1) + step * along, along
-
-
-def with_room(array: wp.array, count: int) -> wp.array:
-    """The array, or a longer copy, padded with zeros, if it is shorter than ``count``."""
-    if count <= len(array):
-        return array
-    longer = wp.zeros(max(count, 3 * len(array) // 2), dtype=array.dtype, device=array.device)
-    wp.copy(longer, array, count=len(array))
-    return longer
+    return corners.mean(axis=1) + step * along, along
 
 
 def _checked(function: Callable[[np.ndarray], Any], points: np.ndarray) -> np.ndarray:
