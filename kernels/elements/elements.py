@@ -54,6 +54,7 @@ class GeneralElements:
     targets: wp.array[wp.vec4i]  # [T] as in ForestElements
     rest_inverse: wp.array[wp.mat33]  # [T] inverse of the matrix of rest edges (x1-x0, x2-x0, x3-x0) [1/m]
     volume: wp.array[wp.float32]  # [T] rest volume [m^3]
+    numbers: wp.array[wp.int32]  # [T] which of a mesh's elements they are; empty: all of them (CPU)
 
 
 @wp.func_native("""

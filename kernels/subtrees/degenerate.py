@@ -18,7 +18,6 @@ from warp_corot.kernels.elements.elements import (
     nodal_forces,
     scatter_stress,
 )
-from warp_corot.kernels.elements.forces import repair_forces
 from warp_corot.kernels.elements.simd8 import LAW_HEADERS, law_kernel
 from warp_corot.kernels.math.matrices import identity3
 from warp_corot.kernels.math.rotation import rotation_out_of_line
@@ -225,7 +224,7 @@ def stress_out_of_line(w: wp.mat33, mu: float, lam: float):
 
 
 @wp.func
-def own_stress(elements: Any, t: int, material: IsotropicMaterial, u: wp.array[wp.vec4]):
+def robust_own_stress(elements: Any, t: int, material: IsotropicMaterial, u: wp.array[wp.vec4]):
     """First Piola-Kirchhoff stress of element t with its own rotation, times Q, for any F."""
     q = frame(elements, t)
     w = wp.transpose(q) * local_gradient(elements, t, u)
@@ -284,7 +283,7 @@ def repair_listed_own(
                 if k < total:
                     t = leaves_of_entries(listed, 0, 0, k)
                     targets = elements.targets[t]
-                    p = own_stress(elements, t, material, u)
+                    p = robust_own_stress(elements, t, material, u)
                 f0, f1, f2, f3 = nodal_forces(elements, t, p)
                 add_pairs(f, targets, f0, f1, f2, f3)
                 k += lanes
@@ -413,6 +412,5 @@ def repair_shared(
         member += 1
 
 
-#: Of corotated leaves with own rotations, and of listed general elements.
-repair_own = repair_flagged(IsotropicMaterial, own_stress, functools.partial(wp.kernel, enable_backward=False))
-repair_elements = repair_forces(GeneralElements, IsotropicMaterial, own_stress)
+#: Of corotated leaves with own rotations.
+repair_own = repair_flagged(IsotropicMaterial, robust_own_stress, functools.partial(wp.kernel, enable_backward=False))

@@ -237,6 +237,7 @@ class PlanArrays:
             general = GeneralElements()
             general.nodes = general.targets = _first(leaves.nodes, count)
             general.rest_inverse, general.volume = _first(leaves.rest_inverse, count), _first(leaves.volume, count)
+            general.numbers = _first(self.plan.flat, count)
         return FlatLeaves(
             leaves=_first(self.plan.flat, count),
             elements=self.elements(_first(leaves.nodes, count), _first(leaves.code, count), targets),

@@ -12,7 +12,7 @@ from warp_corot.discretization.discretization import Discretization, discretizat
 from warp_corot.discretization.elements import E, copied
 from warp_corot.discretization.plan import Plan
 from warp_corot.elasticity.clusters import divided
-from warp_corot.elasticity.cpu import ByElements, Lanes, as_general
+from warp_corot.elasticity.cpu import Lanes, SimdForces, as_general
 from warp_corot.elasticity.dilatation import AUTO, bind_law, check_dilatation
 from warp_corot.elasticity.model import ElementField, ForceField, Kept, Model
 from warp_corot.errors import InputError
@@ -286,21 +286,22 @@ class ReinforcedField(FibreField):
             deterministic=deterministic,
         )
         _, self._clusters = divided(discretization, self.plan, reinforced_law, ReinforcedMaterial)
-        self._by_elements = ByElements(discretization, self.plan, ReinforcedMaterial, REINFORCED.stress, FIBRES)
         self._made = Kept(_material)
+        if self.device.is_cpu:
+            self._simd = SimdForces(discretization, self.plan, FIBRES, lambda: self.material, ReinforcedMaterial)
 
     def plan_of(self, discretization: Discretization) -> Plan:
         return discretization.plan(subtrees=self.device.is_cpu, deterministic=self.deterministic)
 
     @property
     def _force_kernels(self) -> list[LoadedKernel]:
-        return self._by_elements.kernels if self._clusters is None else [self._clusters.kernel]
+        return super()._force_kernels if self._clusters is None else [self._clusters.kernel]
 
     def scatter_forces(self, u: wp.array, f: wp.array) -> None:
         if self._clusters is not None:
             self._clusters(self.material, u, f)
         else:
-            self._by_elements(self.element_count, self.material, u, f)
+            super().scatter_forces(u, f)
 
     @property
     def material(self) -> ReinforcedMaterial:

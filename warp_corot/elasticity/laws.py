@@ -109,7 +109,7 @@ class LawSimdField(LawField):
     def __init__(self, discretization: Discretization, law: Law, *, deterministic: bool = False):
         super().__init__(discretization, law, deterministic=deterministic)
         assert law.lanes is not None
-        self._simd = SimdForces(self, law.lanes)
+        self._simd = SimdForces(discretization, self.plan, law.lanes, lambda: self.isotropic)
 
     def plan_of(self, discretization: Discretization) -> Plan:
         return discretization.plan()

@@ -233,7 +233,7 @@ class DevicePlan:
             leaves.mu_row, leaves.lam_row = (names.index(name) for name in ("mu", "lam"))
             leaves.mu, leaves.lam = (wp.zeros(count, dtype=wp.float32, device=self.device) for _ in range(2))
         # The CPU computes eight elements at a time, from rest matrices.
-        if self.device.is_cpu and not self.rotation_shared and count:
+        if self.device.is_cpu and count:
             leaves.rest_inverse = wp.empty(count, dtype=wp.mat33, device=self.device)
             leaves.volume = wp.empty(count, dtype=wp.float32, device=self.device)
             frames = 2 * len(self.forest.pools.frames)

@@ -44,7 +44,7 @@ from warp_corot.kernels.elements.simd8 import LANES
 from warp_corot.kernels.math.rotation import quick_rotation
 from warp_corot.kernels.subtrees import cpu as subtree_cpu
 from warp_corot.kernels.subtrees import cuda as subtree_cuda
-from warp_corot.kernels.subtrees.degenerate import NO_LIST, repair_elements, repair_own, repair_shared
+from warp_corot.kernels.subtrees.degenerate import NO_LIST, repair_own, repair_shared, robust_own_stress
 
 if TYPE_CHECKING:
     from warp_corot.elasticity.corotated.model import CorotatedOptions
@@ -239,7 +239,8 @@ class SubtreeField(CorotatedField):
         self._uniform = discretization.material_stride == 0
         fixed = self.plan.counts is None and self.plan.units is None  # a mesh that changes may come to have units
         if self.device.is_cpu and (model.level is None or fixed):
-            self._simd = SimdForces(self, "corotated", repair_elements, model.tolerance)
+            law = {"repair": robust_own_stress, "tolerance": model.tolerance}
+            self._simd = SimdForces(discretization, self.plan, "corotated", lambda: self.isotropic, **law)
         #: Adds the forces of all leaves, also of those that come later.
         self._clusters: ChangingClusterScatter | None = None
         if self._listed and self.rotation_level is None:
