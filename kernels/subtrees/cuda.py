@@ -23,9 +23,8 @@ from warp_corot.kernels.elements.elements import (
     Subtrees,
     add_four_forces,
     frame,
-    gradient_of,
+    local_gradient,
     nodal_forces,
-    node_displacements,
     root_of,
 )
 from warp_corot.kernels.elements.simd8 import law_kernel
@@ -209,7 +208,7 @@ def scatter_body(uniform: bool) -> wp.Kernel:
     def scatter_body(
         # In
         ranges: wp.array[WorkRange],
-        flat: ForestElements,
+        elements: ForestElements,
         flat_leaves: wp.array[wp.int32],
         material: IsotropicMaterial,
         u: wp.array[wp.vec4],
@@ -226,19 +225,17 @@ def scatter_body(uniform: bool) -> wp.Kernel:
             return
         shape = ranges[k].shape
         if shape == FLAT:
-            m = int(0)
-            if wp.static(not uniform):
-                m = flat_leaves[s]
-            u0, u1, u2, u3 = node_displacements(flat.nodes[s], u)
+            t = flat_leaves[s]
+            m = wp.where(wp.static(uniform), 0, t)
             p, trusted = leaf_stress(
-                gradient_of(flat, s, u0, u1, u2, u3), frame(flat, s), material.mu[m], material.lam[m]
+                local_gradient(elements, t, u), frame(elements, t), material.mu[m], material.lam[m]
             )
             if not trusted:
                 p = wp.mat33()
             reserved = reserve(degenerate, list_of(block), not trusted, ranges[k].count - s)
-            f0, f1, f2, f3 = nodal_forces(flat, s, p)
-            add_neighbours(f, flat.targets[s], f0, f1, f2, f3)
-            append(degenerate, list_of(block), reserved, flat_leaves[s], wp.where(trusted, 0, 1), ranges[k].count - s)
+            f0, f1, f2, f3 = nodal_forces(elements, t, p)
+            add_neighbours(f, elements.targets[t], f0, f1, f2, f3)
+            append(degenerate, list_of(block), reserved, t, wp.where(trusted, 0, 1), ranges[k].count - s)
             return
         subtrees = ranges[k].subtrees
         grouped = ranges[k].grouped != 0

@@ -142,7 +142,7 @@ def test_anisotropic_subtrees_one_by_one(name, kind, device, rng):
         flags += np.unpackbits(as_bytes(left).numpy()).sum()
     flat = plan.flat
     if len(flat):
-        inputs = [flat.elements, flat.leaves, fibres, on_device]
+        inputs = [plan.elements, flat.leaves, fibres, on_device]
         wp.launch(scatter_flat, len(flat), inputs=inputs, outputs=[f], device=device)
     assert flags < 0.3 * len(mesh.tets)
     assert flags > 0 or name == "mixed levels"

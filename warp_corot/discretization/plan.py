@@ -152,9 +152,10 @@ class Batch:
     live: wp.array | None = None
 
     def part(self, begin: int, end: int) -> Batch:
-        """Some of the subtrees, on the CPU; their leaves have own rotations."""
+        """Some of the subtrees, on the CPU; their leaves have own rotations or their root's."""
         flags = wp.zeros(-(-(end - begin) // 8) * 8, dtype=wp.uint8, device="cpu")
-        return replace(self, count=end - begin, subtrees=part_of(self.subtrees, begin, end), flagged=flags)
+        roots = None if self.roots is None else part_of(self.roots, begin, end)
+        return replace(self, count=end - begin, subtrees=part_of(self.subtrees, begin, end), roots=roots, flagged=flags)
 
     @property
     def flags_by_eights(self) -> wp.array:
@@ -200,22 +201,16 @@ class Units:
 
 @dataclass(frozen=True)
 class FlatLeaves:
-    """Leaves outside subtrees, as single elements, world after world.
+    """Leaves outside subtrees, world after world.
 
     Attributes:
         leaves: Their numbers among the mesh's elements, int32 [n]; ``len`` is the number in one launch.
-        elements: ``kernels.elements.elements.ForestElements``.
-        unit: The one of ``Units`` that each uses if rotations are shared, int32 [n], else None.
-        general: The same leaves as general elements, if these exist, else None.
-        material: Their Lamé parameters mu and lambda [Pa] if these vary and are kept, float32 [n] each, else None.
+        general: The same leaves as general elements, on the CPU; else None.
         live: The number of leaves, if launches cover more, int32 [1] on the device, else None.
     """
 
     leaves: wp.array
-    elements: Elements
-    unit: wp.array | None = None
     general: GeneralElements | None = None
-    material: tuple[wp.array, wp.array] | None = None
     live: wp.array | None = None
 
     def __len__(self) -> int:

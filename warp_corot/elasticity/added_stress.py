@@ -50,7 +50,7 @@ class AddedForces:
     def __init__(
         self, discretization: Discretization, law: ForceField, Material: type, stress: wp.Function, native: NativeLaw
     ):
-        self._law, self._material, plan = law, None, law.plan
+        self._law, self._material, plan = law, cast("Any", None), law.plan
         if law.deterministic:
             plan = discretization.plan(subtrees=False, deterministic=True)
         self._elements, self._slots = plan.elements, plan.slots

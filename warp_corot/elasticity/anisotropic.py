@@ -213,7 +213,7 @@ class AnisotropicCudaField(AnisotropicField):
         if self._clusters is not None:
             self._clusters(active, u, f)
         elif len(flat):
-            self.launch(scatter_flat, len(flat), [flat.elements, flat.leaves, fibres, u], [f])
+            self.launch(scatter_flat, len(flat), [self.elements, flat.leaves, fibres, u], [f])
 
     def follow(self) -> None:
         law = anisotropic_law(self._transverse)

@@ -26,7 +26,7 @@ from warp_corot.kernels.elements.cpu import (
     scatter_grouped_elements,
 )
 from warp_corot.kernels.elements.dilatation import Dilatation
-from warp_corot.kernels.elements.elements import GeneralElements
+from warp_corot.kernels.elements.elements import ForestElements, GeneralElements
 from warp_corot.kernels.elements.forces import repair_forces
 from warp_corot.kernels.elements.simd8 import LANES, IsotropicLaw, NativeLaw, elastic
 from warp_corot.kernels.subtrees.cpu import (
@@ -38,7 +38,6 @@ from warp_corot.kernels.subtrees.cpu import (
     scatter_subtrees_tolerance,
 )
 from warp_corot.kernels.subtrees.degenerate import repair_flagged, repair_own, repair_shared, robust_own_stress
-from warp_corot.mesh import TetForest
 
 if TYPE_CHECKING:
     from warp_corot.discretization.discretization import Discretization
@@ -54,9 +53,7 @@ class Lanes:
         repair: Kernel that computes the listed ones among ``elements``; None if none are left out or listed.
     """
 
-    def __init__(
-        self, elements: Elements, general: GeneralElements, *, scatter: wp.Kernel, repair: wp.Kernel | None = None
-    ):
+    def __init__(self, elements: Elements, general: Elements, *, scatter: wp.Kernel, repair: wp.Kernel | None = None):
         self.count, self.nodes = len(general.nodes), general.nodes
         self._elements, self._general = elements, general
         self.kernels: list[LoadedKernel] = [scatter] if repair is None else [scatter, repair]
@@ -75,7 +72,7 @@ class Lanes:
     def part(self, begin: int, end: int) -> Lanes:
         """The launches of some of the elements."""
         part, general = copy(self), part_of(self._general, begin, end)
-        if not self._general.numbers:
+        if not general.numbers:
             general.numbers = wp.array(np.arange(begin, end), dtype=wp.int32, device="cpu")
         part.count, part.nodes, part._general = end - begin, general.nodes, general
         part._degenerate = wp.zeros_like(self._degenerate)
@@ -209,8 +206,7 @@ def _material(isotropic: IsotropicMaterial, lam: wp.array, tolerance: float | No
 
 
 class SimdForces:
-    """The forces of a law on the CPU: of complete subtrees, whose leaves have own rotations or their root's, and of other
-    elements.
+    """The forces of a law on the CPU: of complete subtrees, and of other elements.
 
     With a shared dilatation the elements outside subtrees are in groups, and these launches add its forces, too.
 
@@ -234,7 +230,7 @@ class SimdForces:
         repair: wp.Function | None = None,
         tolerance: float | None = None,
     ):
-        self._mesh, self._worlds, self.plan = discretization.mesh, discretization.worlds, plan
+        self._worlds, self.plan = discretization.worlds, cast("Any", plan)
         self._name: Any = law
         self._shares_rotations = law == "corotated"
         self._law = law if isinstance(law, NativeLaw) else elastic(law)
@@ -246,7 +242,8 @@ class SimdForces:
             self._repairs = of_subtrees, *(repair_forces(kind, Material, repair) for kind in kinds)
         self._dilating: Dilating | None = None
         self._near, self._rotated = Kept(_near_material), Kept(rotated_material)
-        self._no_rotations, self._no_unit = (wp.empty(0, dtype=kind, device="cpu") for kind in (wp.mat33, wp.int32))
+        #: The rotations of the plan's units, for batches that share those from further up.
+        self.rotations, self._no_unit = (wp.empty(0, dtype=kind, device="cpu") for kind in (wp.mat33, wp.int32))
         self.follow()
 
     def share_dilatation(self, dilating: Dilating) -> None:
@@ -264,18 +261,12 @@ class SimdForces:
         """See ``ForceField``."""
         plan = self.plan
         self._flat, self._lanes, elements = plan.flat, None, plan.elements
-        if self._dilating is not None:
+        shares = self._shares_rotations and plan.units is not None
+        if self._dilating is not None or shares or (plan.kinds and not len(plan.flat)):
             return
-        if isinstance(self._mesh, TetForest):
-            if plan.kinds and not len(plan.flat):
-                return
-            general = plan.flat.general
-            if general is None:
-                chosen = plan.flat.elements
-                general = as_general(chosen, rest_matrices, [chosen])
-                general.numbers = plan.flat.leaves
-        else:
-            general = elements
+        general = plan.flat.general or elements
+        if isinstance(general, ForestElements):
+            general = as_general(elements, rest_matrices, [elements])
         repair = self._repairs[1] if self._repairs else None
         self._lanes = Lanes(elements, general, scatter=self._of_elements, repair=repair)
 
@@ -295,7 +286,7 @@ class SimdForces:
 
     def _kernel(self, shape: int, sharing: Sharing) -> wp.Kernel:
         if self._shares_rotations and sharing is not Sharing.OWN:
-            return scatter_subtrees_shared(shape, False)
+            return scatter_subtrees_shared(shape, sharing is Sharing.ABOVE)
         shared = None if self._dilating is None else self._dilating.of
         if self._tolerance is not None:
             return scatter_subtrees_tolerance(shape, shared)
@@ -317,10 +308,11 @@ class SimdForces:
                 continue
             own = not self._shares_rotations or batch.sharing is Sharing.OWN
             first, threads = batch.subtrees.first, -(-batch.count // LANES)
-            of_batch = material if own else self._rotated(given, self._no_rotations, self._no_unit)
+            unit = self._no_unit if batch.unit is None else batch.unit
+            of_batch = material if own else self._rotated(given, self.rotations, unit)
             inputs, kernel = [batch.subtrees, batch.count, of_batch, u], self._kernel(batch.shape, batch.sharing)
             launch(kernel, threads, inputs, [f, batch.flagged], device="cpu")
-            if self._repairs:
+            if self._repairs and (own or batch.sharing is Sharing.ROOT):
                 flags, inputs = batch.flags_by_eights, [self.plan.elements, given, u]
                 repair, where = self._repairs[0], [1, flags, first]
                 if not own:
@@ -333,7 +325,7 @@ class SimdForces:
 
     def pieces(self, team: Team) -> list[Piece]:
         """See ``ForceField``: copies, each with some of the subtrees and of the other elements."""
-        if self.plan.counts is not None:
+        if self.plan.counts is not None or (self._shares_rotations and self.plan.units is not None):
             return []
 
         def parts_of(whole: Any) -> list[Any]:

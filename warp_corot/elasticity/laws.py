@@ -21,6 +21,7 @@ from warp_corot.inputs.checks import checked_number, shown
 from warp_corot.inputs.loading import LoadedKernel, load
 from warp_corot.kernels.clusters.laws import isotropic_law
 from warp_corot.kernels.elements.constitutive import (
+    IsotropicMaterial,
     law_functions,
     linear_differential,
     linear_energy,
@@ -33,6 +34,7 @@ from warp_corot.kernels.elements.constitutive import (
     stvk_stress,
 )
 from warp_corot.kernels.elements.dilatation import GREEN, LOG_VOLUME, SMALL, Dilatation
+from warp_corot.kernels.elements.forces import scatter_chosen
 from warp_corot.kernels.elements.simd8 import IsotropicLaw, bare, stretch_limits
 from warp_corot.kernels.subtrees import cuda as subtree_cuda
 from warp_corot.kernels.subtrees.degenerate import NO_LIST
@@ -66,16 +68,21 @@ class LawCudaField(LawField):
         of_subtrees: list[LoadedKernel] = [(kernel, BLOCK) for kernel in self._kernels]
         if self._clusters is not None:
             return [*of_subtrees, self._clusters.kernel]
-        return of_subtrees if self._batches and not len(self.plan.flat) else [*of_subtrees, self._forces]
+        if self._batches and not len(self.plan.flat):
+            return of_subtrees
+        return [*of_subtrees, self._of_flat if len(self.plan.flat) else self._forces]
 
     def load_kernels(self) -> None:
         kernels = [self._kernel(shape, grouped) for shape, grouped, _sharing in self.plan.kinds]
-        load((), self.device, [self._forces, *((kernel, BLOCK) for kernel in kernels)])
+        load((), self.device, [self._forces, self._of_flat, *((kernel, BLOCK) for kernel in kernels)])
 
     def follow(self) -> None:
         self._batches, self._clusters = divided(self.discretization, self.plan, isotropic_law(self.law.stress))
         self._kernels = [self._kernel(batch.shape, batch.grouped) for batch in self._batches]
-        self._flat_material = self.isotropic_of(self.plan.flat)
+
+    @property
+    def _of_flat(self) -> wp.Kernel:
+        return scatter_chosen(self.discretization.element_kind, IsotropicMaterial, self._functions[0])
 
     @property
     def in_clusters(self) -> tuple[ClusterScatter, Sequence[Batch]] | None:
@@ -92,7 +99,7 @@ class LawCudaField(LawField):
         if self._clusters is not None:
             self._clusters(isotropic, u, f)
         elif len(flat):
-            self.launch(self._forces, len(flat), [flat.elements, self._flat_material, u], [f])
+            self.launch(self._of_flat, len(flat), [self.elements, flat.leaves, isotropic, u], [f])
         elif not self._batches:
             super().scatter_forces(u, f)
 

@@ -14,7 +14,7 @@ import warp as wp
 
 from warp_corot.discretization.discretization import Discretization, Discretized, discretization_of
 from warp_corot.discretization.groups import Members
-from warp_corot.discretization.plan import Batch, FlatLeaves, Plan, chosen
+from warp_corot.discretization.plan import Batch, Plan
 from warp_corot.elasticity.divided import DividedForces, Piece
 from warp_corot.elasticity.tangents import ElementTangent, Tangent
 from warp_corot.errors import InputError
@@ -160,8 +160,6 @@ class ForceField(ABC):
         #: On the CPU there is one thread, and the order is always the same.
         self.deterministic = deterministic and discretization.device.is_cuda
         self._isotropic = Kept(lambda *values: isotropic_material(list(values)))
-        #: Leaves in no subtree, and copies of their Lamé's parameters.
-        self._flat_lame: tuple[wp.array, list[wp.array]] | None = None
         self._regions = Regions(discretization.team, self.device)
         self.plan = self.plan_of(discretization)
         self.elements, self.slots = self.plan.elements, self.plan.slots
@@ -253,10 +251,6 @@ class ForceField(ABC):
 
     def take_material(self) -> None:
         """Copy Lamé's parameters again, because their values have changed in the arrays."""
-        if self._flat_lame is not None:
-            leaves, own = self._flat_lame
-            for copy, values in zip(own, self._lame, strict=True):
-                copy.assign(chosen(values, leaves))
         if self._simd is not None:
             self._simd.derive()
 
@@ -411,27 +405,6 @@ class ForceField(ABC):
     def isotropic_shown(self) -> IsotropicMaterial:
         """Lamé's parameters for stresses: those of the material."""
         return isotropic_material(list(self.discretization.lame))
-
-    def isotropic_of(self, flat: FlatLeaves) -> IsotropicMaterial:
-        """Lamé's parameters for the forces of leaves in no subtree."""
-        kept = self.discretization.lame_of_flat(flat)
-        if kept is not None:
-            return isotropic_material([*kept, 1])
-        if self.discretization.material_stride == 0 or not len(flat):
-            return self.isotropic
-        if self._flat_lame is not None and self._flat_lame[0] is flat.leaves:
-            # One copy for all that read it: ``take_material`` updates one.
-            own = self._flat_lame[1]
-            for copy, values in zip(own, self._lame, strict=True):
-                copy.assign(chosen(values, flat.leaves))
-        else:
-            own = [chosen(values, flat.leaves) for values in self._lame]
-            self._flat_lame = flat.leaves, own
-        return isotropic_material([*own, 1])
-
-    @property
-    def _lame(self) -> tuple[wp.array, wp.array]:
-        return self.discretization.mu, self.discretization.lam
 
 
 class Model(ABC):

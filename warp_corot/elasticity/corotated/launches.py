@@ -123,7 +123,7 @@ class OwnLaunches:
     ):
         self._device = plan.elements.nodes.device
         self._material = material
-        batches, self._flat = list(plan.batches), plan.flat
+        batches, self._flat, self._elements = list(plan.batches), plan.flat, plan.elements
         self._clusters: Callable[[IsotropicMaterial, wp.array, wp.array], None] | None = None
         if plan.counts is None:
             batches, leaves = grouped_and_others(plan, _fewest_grouped(plan))
@@ -182,7 +182,7 @@ class OwnLaunches:
             wp.launch(
                 scatter_body(material.stride == 0),
                 dim=self._blocks * BLOCK,
-                inputs=[self._ranges, self._flat.elements, self._flat.leaves, material, u],
+                inputs=[self._ranges, self._elements, self._flat.leaves, material, u],
                 outputs=[f, degenerate],
                 device=self._device,
                 block_dim=BLOCK,
