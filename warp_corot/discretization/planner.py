@@ -248,7 +248,7 @@ class PlanArrays:
 
     def _rest_matrices(self, codes: npt.NDArray[np.integer]) -> tuple[wp.array, wp.array]:
         """Rest matrices and volumes of elements by their codes."""
-        elements = self.elements(self.plan.flat, wp.array(codes, dtype=wp.int32, device=self.device))
+        elements = self.elements(self.leaves.nodes, wp.array(codes, dtype=wp.int32, device=self.device))
         found = self._empty(len(codes), wp.mat33), self._empty(len(codes), wp.float32)
         wp.launch(rest_matrices, len(codes), [elements], list(found), device=self.device)
         return found
