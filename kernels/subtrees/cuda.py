@@ -16,7 +16,7 @@ from typing import Any
 import warp as wp
 
 from warp_corot.kernels.corotated.corotated import stretch_stress
-from warp_corot.kernels.elements.constitutive import IsotropicMaterial, RotatedMaterial, linear_stress
+from warp_corot.kernels.elements.constitutive import IsotropicMaterial, RotatedMaterial, law_functions
 from warp_corot.kernels.elements.dilatation import Dilatation
 from warp_corot.kernels.elements.elements import (
     ForestElements,
@@ -153,11 +153,10 @@ def scatter_dilatation(shape: int, grouped: bool, uniform: bool, of: Dilatation)
 
 def scatter_subtrees_shared(shape: int, grouped: bool, uniform: bool, given: bool, listed: bool) -> wp.Kernel:
     """Corotated forces of subtrees whose leaves share a rotation: that of the subtree's root, or a given one."""
-    leaves, missed = isotropic_leaves(shape, always_trusted(linear_stress)), "list" if listed else "flags"
-    turn, missed, resident = shared_turn(shape, given), "" if given else missed, 0 if given else 7
-    return scatter_subtrees(
-        shape, grouped, uniform, leaves, RotatedMaterial, missed=missed, resident=resident, turn=turn
-    )
+    leaves, turn = isotropic_leaves(shape, always_trusted(law_functions("linear").stress)), shared_turn(shape, given)
+    missed, resident = ("", 0) if given else ("list" if listed else "flags", 7)
+    options: dict[str, Any] = {"missed": missed, "resident": resident, "turn": turn}
+    return scatter_subtrees(shape, grouped, uniform, leaves, RotatedMaterial, **options)
 
 
 # --- all of a body in one launch ------------------------------------------------------------------------------------

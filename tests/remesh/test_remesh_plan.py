@@ -108,7 +108,7 @@ class Comparison:
         padding = flat.leaves.numpy()[count:]
         assert (padding >= self.leaves).all()
         self.assert_sinks(self.plan.elements.nodes.numpy()[padding])
-        if flat.general is not None:
+        if flat.general is not None and count:
             for name in ("nodes", "rest_inverse", "volume"):
                 own, other = (getattr(each.general, name).numpy()[here] for each in (flat, expected))
                 assert np.array_equal(own, other)

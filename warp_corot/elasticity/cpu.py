@@ -13,10 +13,10 @@ import warp as wp
 from warp_corot.discretization.elements import Elements, copied
 from warp_corot.discretization.plan import Plan, Sharing
 from warp_corot.elasticity.divided import Piece
-from warp_corot.elasticity.model import Kept, isotropic_material, rotated_material
+from warp_corot.elasticity.model import ROTATED, Kept, isotropic_material
 from warp_corot.inputs.cpu_threads import Team, launch, part_of
 from warp_corot.inputs.loading import LoadedKernel, load
-from warp_corot.kernels.elements.constitutive import IsotropicMaterial
+from warp_corot.kernels.elements.constitutive import IsotropicMaterial, RotatedMaterial
 from warp_corot.kernels.elements.cpu import (
     GROUPS,
     GroupedMaterial,
@@ -118,7 +118,7 @@ class Dilating:
     ):
         self.of, self.count = of, 0
         self._lam, self._plan, self._order = lam, plan, order_elements(kind)
-        self._of_subtrees = Kept(_material)
+        self._of_subtrees = Kept(DilatingMaterial, "isotropic", "lam", "tolerance")
         load(["elements.cpu"], wp.get_device("cpu"), [self._order])
         self._members, self._live, most = members, live, len(members)
         general = self._general = GeneralElements()
@@ -137,8 +137,7 @@ class Dilating:
             isotropic: The material, without lambda.
             tolerance: For the corotated law, the largest angle at which the root's rotation is used [rad]; None: never.
         """
-        made: DilatingMaterial = self._of_subtrees(isotropic, self._lam(), tolerance)
-        return made
+        return self._of_subtrees(isotropic, self._lam(), tolerance or 0.0)
 
     def parts(self, team: Team, worlds: int) -> list[Dilating]:
         """The same, each with some of the groups of all worlds, if the mesh does not change."""
@@ -148,7 +147,7 @@ class Dilating:
 
     def _part(self, begin: int, end: int) -> Dilating:
         part = copy(self)
-        part.count, part._of_groups, part._of_subtrees = end - begin, copied(self._of_groups), Kept(_material)
+        part.count, part._of_groups = end - begin, copied(self._of_groups)
         part._of_groups.starts = self._of_groups.starts[begin : end + 1]
         part._degenerate = wp.zeros_like(self._degenerate)
         return part
@@ -196,12 +195,6 @@ class Dilating:
             launch(repair, 1, [self._general, self._of_groups.isotropic, u], [self._degenerate, f], device="cpu")
 
 
-def _material(isotropic: IsotropicMaterial, lam: wp.array, tolerance: float | None) -> DilatingMaterial:
-    material = DilatingMaterial()
-    material.isotropic, material.lam, material.tolerance = isotropic, lam, tolerance or 0.0
-    return material
-
-
 # --- any law: complete subtrees, and other elements ------------------------------------------------------------------
 
 
@@ -241,7 +234,8 @@ class SimdForces:
             of_subtrees = repair_own if repair is robust_own_stress else repair_flagged(Material, repair)
             self._repairs = of_subtrees, *(repair_forces(kind, Material, repair) for kind in kinds)
         self._dilating: Dilating | None = None
-        self._near, self._rotated = Kept(_near_material), Kept(rotated_material)
+        self._near = Kept(ToleranceMaterial, "isotropic", "tolerance")
+        self._rotated = Kept(RotatedMaterial, *ROTATED)
         #: The rotations of the plan's units, for batches that share those from further up.
         self.rotations, self._no_unit = (wp.empty(0, dtype=kind, device="cpu") for kind in (wp.mat33, wp.int32))
         self.follow()
@@ -347,9 +341,3 @@ class SimdForces:
         if self._dilating is not None:
             return [*nodes, self._dilating.nodes] if self._dilating.count else nodes
         return nodes if self._lanes is None else [*nodes, self._lanes.nodes]
-
-
-def _near_material(isotropic: IsotropicMaterial, tolerance: float) -> ToleranceMaterial:
-    material = ToleranceMaterial()
-    material.isotropic, material.tolerance = isotropic, tolerance
-    return material

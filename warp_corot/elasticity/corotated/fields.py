@@ -22,7 +22,7 @@ from warp_corot.elasticity.corotated.tangents import (
     subtrees_of,
 )
 from warp_corot.elasticity.cpu import Dilating, SimdForces
-from warp_corot.elasticity.model import ForceField, Kept, StressLaw, rotated_material
+from warp_corot.elasticity.model import ROTATED, ForceField, Kept, StressLaw
 from warp_corot.elasticity.tangents import Tangent
 from warp_corot.inputs.loading import LoadedKernel, load
 from warp_corot.kernels.clusters.laws import isotropic_law
@@ -72,7 +72,7 @@ class CorotatedField(ForceField):
         kind = discretization.element_kind
         self._shared: Rotations | None = None
         self._fused = model.level is None
-        self._rotated = Kept(rotated_material)
+        self._rotated = Kept(RotatedMaterial, *ROTATED)
         self._extract = extract_rotations(kind, model.own_rotation)
         self._own = scatter_forces(kind, IsotropicMaterial, own_stress(model.own_rotation))
         self._forces = scatter_forces(kind, RotatedMaterial, given_stress)
@@ -152,7 +152,7 @@ class CorotatedField(ForceField):
 
     def material_with(self, rotations: wp.array) -> RotatedMaterial:
         """The material with these rotations of the units."""
-        return rotated_material(self.isotropic, rotations, self._sharing().units.unit)
+        return Kept(RotatedMaterial, *ROTATED)(self.isotropic, rotations, self._sharing().units.unit)
 
     @property
     def stress_law(self) -> StressLaw | None:
@@ -316,7 +316,7 @@ class SubtreeField(CorotatedField):
             self._simd.rotations = self._rotations
             return
         self._kernels = [self._kernel(batch.shape, batch.grouped, batch.sharing) for batch in plan.batches]
-        self._batch_materials = [Kept(rotated_material) for _ in plan.batches]
+        self._batch_materials = [Kept(RotatedMaterial, *ROTATED) for _ in plan.batches]
 
     @property
     def _listed(self) -> bool:
