@@ -10,7 +10,7 @@ from warp_corot.kernels.elements.elements import LEVEL_MASK
 from warp_corot.kernels.tables.shapes import MIRROR_BIT
 
 from .lists import LEAVES_OF_SUBTREE
-from .plan import SINKS, Plan, Tree, code_above, extent, flat_row, padding, places_t, sink
+from .plan import SINKS, Plan, Tree, code_above, extent, flat_row, places_t, sink
 
 wp.set_module_options({"enable_backward": False})
 
@@ -32,11 +32,9 @@ class Batches:
     node_begin: places_t
     room: places_t
     nodes: wp.array[wp.int32]
-    # As ``Plan.first``; ``roots`` is the place there of the first class that shares its root's rotation.
+    # As ``Plan.first``.
     code: wp.array[wp.int32]  # of the root
     unit: wp.array[wp.int32]  # used by the leaves, if a rotation further up is shared
-    roots: int
-    root_nodes: wp.array[wp.vec4i]  # counted from there
 
 
 @wp.struct
@@ -83,16 +81,6 @@ def node_place(c: int, k: int, n: int, batches: Batches):
 def share_place(c: int, k: int, n: int, batches: Batches):
     """The place of the n-th of the five nodes of a group that go with its subtree k of a class."""
     return batches.node_begin[c] + 5 * k + n
-
-
-@wp.func
-def root_nodes(first: int, shape: int, shift: int, tree: Tree, batches: Batches):
-    """The corners of a subtree, the first four of its nodes."""
-    nodes = wp.vec4i(0)
-    for n in range(4):
-        place = batches.places[shape, n]
-        nodes[n] = tree.leaf_tets[first + place[0]][place[1]] + shift
-    return nodes
 
 
 @wp.func
@@ -148,17 +136,13 @@ def fill_batches(
             code = plan.code[first]
             for _ in range(3):
                 code = code_above(code, 0, tree)
-            if kind == 3:
-                batches.root_nodes[place - batches.roots] = root_nodes(first, shape, shift, tree, batches)
-            elif kind > 3:
+            if kind > 3:
                 batches.unit[place] = plan.unit[first] + world * plan.world_units
             if world > 0:
                 plan.first[place] = first + world * plan.world_leaves
         else:
             plan.first[place] = 0
-            if kind == 3:
-                batches.root_nodes[place - batches.roots] = padding(k, tree)
-            elif kind > 3:
+            if kind > 3:
                 batches.unit[place] = 0
         batches.code[place] = code
         if not grouped:

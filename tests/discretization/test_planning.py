@@ -70,9 +70,6 @@ def assert_same(plan, expected):
         assert np.array_equal(by_unit(batch.subtrees.nodes, batch.grouped), wanted.nodes)
         assert np.array_equal(by_unit(batch.subtrees.targets, batch.grouped), wanted.targets)
         assert_same_codes(batch.subtrees, wanted.codes, wanted.frames)
-        assert (batch.roots is not None) == (batch.sharing is Sharing.ROOT)
-        if batch.roots is not None:
-            assert np.array_equal(batch.roots.nodes.numpy(), wanted.root_nodes)
         assert (batch.unit is not None) == (batch.sharing is Sharing.ABOVE)
         if batch.unit is not None:
             assert_same_units(plan.units, batch.unit, expected.units, expected.units.unit[wanted.first])

@@ -17,7 +17,6 @@ import warp_corot as wc
 from warp_corot.discretization.planner import ForcePlan
 from warp_corot.elasticity.anisotropic import ACTIVE, AnisotropicField
 from warp_corot.elasticity.clusters import ClusterScatter, clustered
-from warp_corot.elasticity.laws import law_of
 from warp_corot.elasticity.model import Kept, isotropic_material
 from warp_corot.kernels.clusters.laws import ActiveMaterial, anisotropic_law, isotropic_law, reinforced_law
 from warp_corot.kernels.corotated.anisotropic import FibreMaterial, ReinforcedMaterial, fibre_stress
@@ -160,7 +159,7 @@ def test_laws_in_clusters_are_those_leaf_by_leaf(model, name, device, rng):
     given, _ = materials(len(mesh.tets), False, rng)
     law, Material, material = reinforced_law, ReinforcedMaterial, wc.Isotropic(**given)
     if model is OGDEN:
-        law, Material = isotropic_law(law_of(model.terms).stress), IsotropicMaterial
+        law, Material = isotropic_law(constitutive.law_functions(model.terms).stress), IsotropicMaterial
     else:
         along, across, _ = random_axes(rng)
         material = wc.FibreReinforced(k1=1e4, k2=5.0, direction=along, across=across, angle=0.5, kappa=0.1, **given)

@@ -86,8 +86,6 @@ class Comparison:
             assert np.array_equal(batch.subtrees.first.numpy()[here], expected.subtrees.first.numpy())
             assert np.array_equal(nodes[:rows], by_unit(expected))
             assert_same_shapes(batch.subtrees, expected.subtrees, here, here)
-            if batch.sharing is Sharing.ROOT:
-                assert_same_elements(batch.roots, expected.roots, here, here)
             if batch.sharing is Sharing.ABOVE:
                 own, other = batch.unit.numpy()[here], expected.unit.numpy()
                 assert_same_elements(self.plan.units.elements, self.expected.units.elements, own, other)
@@ -96,8 +94,6 @@ class Comparison:
         assert (nodes[rows:, named:] == -1).all()
         self.assert_exact(batch.subtrees, count)
         assert not batch.subtrees.first.numpy()[count:].any()
-        if batch.sharing is Sharing.ROOT:
-            self.assert_padding(batch.roots, count)
         if batch.sharing is Sharing.ABOVE:
             assert not batch.unit.numpy()[count:].any()
 

@@ -19,7 +19,7 @@ import warp as wp
 from warp_corot.discretization.elements import Elements, in_worlds
 from warp_corot.errors import InputError
 from warp_corot.inputs.cpu_threads import launch, part_of
-from warp_corot.kernels.elements.elements import ForestElements, GeneralElements, Subtrees, gather_slots
+from warp_corot.kernels.elements.elements import GeneralElements, Subtrees, gather_slots
 from warp_corot.kernels.plan.slots import find_starts, number_slots, order_slots
 
 #: Slots are numbered in 32 bits.
@@ -134,7 +134,6 @@ class Batch:
         count: Number of subtrees.
         sharing: The owner of the rotation that their leaves use.
         subtrees: ``kernels.elements.elements.Subtrees``.
-        roots: Their roots as forest elements if leaves share the root's rotation, else None.
         unit: The one of ``Units`` that each uses if leaves share a rotation from further up, int32 [count], else None.
         flagged: Set by the kernel: bit k of a subtree's byte if its leaf k, in tree order, was left out; uint8
             [count, rounded up to eights].
@@ -146,7 +145,6 @@ class Batch:
     count: int
     sharing: Sharing
     subtrees: Subtrees
-    roots: ForestElements | None
     unit: wp.array | None
     flagged: wp.array
     live: wp.array | None = None
@@ -154,8 +152,7 @@ class Batch:
     def part(self, begin: int, end: int) -> Batch:
         """Some of the subtrees, on the CPU; their leaves have own rotations or their root's."""
         flags = wp.zeros(-(-(end - begin) // 8) * 8, dtype=wp.uint8, device="cpu")
-        roots = None if self.roots is None else part_of(self.roots, begin, end)
-        return replace(self, count=end - begin, subtrees=part_of(self.subtrees, begin, end), roots=roots, flagged=flags)
+        return replace(self, count=end - begin, subtrees=part_of(self.subtrees, begin, end), flagged=flags)
 
     @property
     def flags_by_eights(self) -> wp.array:

@@ -193,8 +193,6 @@ class PlanArrays:
         batches.nodes, batches.code = self._empty(node_begin[-1]), self._empty(begin[-1])
         if len(self.kinds) > 3:
             batches.unit = self._empty(begin[-1])
-            batches.roots = begin[3 * plan.members]
-            batches.root_nodes = self._empty(begin[4 * plan.members] - batches.roots, wp.vec4i)
         if self.device.is_cpu and room.flat and plan.with_subtrees:
             # The CPU computes eight elements at a time, from rest matrices.
             leaves.nodes, leaves.rest_inverse = (self._empty(room.flat, kind) for kind in (wp.vec4i, wp.mat33))
@@ -227,14 +225,9 @@ class PlanArrays:
         subtrees.targets = subtrees.nodes if targets is None else self._nodes(targets, row, count)
         subtrees.code, subtrees.first = arrays.code[here], self.plan.first[here]
         subtrees.frames, subtrees.size = self._elements_like.frames, self._elements_like.size
-        roots = unit = None
-        if sharing is Sharing.ROOT:
-            first = begin - arrays.roots
-            roots = self.elements(arrays.root_nodes[first : first + count], subtrees.code)
-        elif sharing is Sharing.ABOVE:
-            unit = arrays.unit[here]
+        unit = arrays.unit[here] if sharing is Sharing.ABOVE else None
         flagged = self._flagged[begin : begin + -(-count // 8) * 8]
-        return Batch(shape, self.is_grouped(row), count, sharing, subtrees, roots, unit, flagged)
+        return Batch(shape, self.is_grouped(row), count, sharing, subtrees, unit, flagged)
 
     def flat(self, count: int) -> FlatLeaves:
         """The first leaves outside subtrees."""

@@ -12,6 +12,7 @@ import warp as wp
 
 from warp_corot.discretization.elements import Elements, copied
 from warp_corot.discretization.plan import Plan, Sharing
+from warp_corot.discretization.planner import places_on
 from warp_corot.elasticity.divided import Piece
 from warp_corot.elasticity.model import ROTATED, Kept, isotropic_material
 from warp_corot.inputs.cpu_threads import Team, launch, part_of
@@ -240,11 +241,14 @@ class SimdForces:
         self.rotations, self._no_unit = (wp.empty(0, dtype=kind, device="cpu") for kind in (wp.mat33, wp.int32))
         self.follow()
 
-    def share_dilatation(self, dilating: Dilating) -> None:
-        """Add the forces of a shared dilatation, too, from now on."""
+    def share_dilatation(self, dilating: Dilating) -> bool:
+        """Add the forces of a shared dilatation, too, from now on; return whether the law is an isotropic one."""
+        if isinstance(self._name, NativeLaw):
+            return False
         self._dilating = dilating
         self.derive()
         self.follow()
+        return True
 
     def derive(self) -> None:
         """See ``ForceField``."""
@@ -310,7 +314,7 @@ class SimdForces:
                 flags, inputs = batch.flags_by_eights, [self.plan.elements, given, u]
                 repair, where = self._repairs[0], [1, flags, first]
                 if not own:
-                    repair, where = repair_shared, [flags, first, batch.roots]
+                    repair, where = repair_shared, [flags, first, batch.subtrees.code, places_on("cpu").subtree]
                 launch(repair, len(flags), [*where, *inputs], [f], device="cpu")
         if self._dilating is not None:
             self._dilating.scatter_groups(self._name, u, f, self._repairs[2] if self._repairs else None)

@@ -264,9 +264,7 @@ class ForceField(ABC):
         """Add the forces of a dilatation that subtrees and groups share, too, from now on (CPU); return whether the
         field can.
         """
-        if self._simd is not None:
-            self._simd.share_dilatation(dilating)
-        return self._simd is not None
+        return self._simd is not None and self._simd.share_dilatation(dilating)
 
     @property
     def stiffest(self) -> SmallForces:

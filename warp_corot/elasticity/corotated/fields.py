@@ -11,6 +11,7 @@ import warp as wp
 
 from warp_corot.discretization.discretization import Discretization
 from warp_corot.discretization.plan import Batch, Plan, Sharing, Units
+from warp_corot.discretization.planner import places_on
 from warp_corot.elasticity.clusters import ChangingClusterScatter, ClusterScatter, clustered
 from warp_corot.elasticity.corotated.launches import DegenerateLeaves, OwnLaunches
 from warp_corot.elasticity.corotated.tangents import (
@@ -367,4 +368,5 @@ class SubtreeField(CorotatedField):
         if own:
             self.launch(repair_own, len(flags), [1, flags, batch.subtrees.first, *inputs], [f])
         elif batch.sharing is Sharing.ROOT:
-            self.launch(repair_shared, len(flags), [flags, batch.subtrees.first, batch.roots, *inputs], [f])
+            where = [flags, batch.subtrees.first, batch.subtrees.code, places_on(self.device.alias).subtree]
+            self.launch(repair_shared, len(flags), [*where, *inputs], [f])
