@@ -224,14 +224,15 @@ class SimdForces:
         repair: wp.Function | None = None,
         tolerance: float | None = None,
     ):
-        self._worlds, self.plan = discretization.worlds, cast("Any", plan)
+        self._kind, self._worlds = discretization.element_kind, discretization.worlds
+        self.plan: Any = plan
         self._name: Any = law
         self._shares_rotations = law == "corotated"
         self._law = law if isinstance(law, NativeLaw) else elastic(law)
         self._Material, self._material, self._tolerance = Material, material, tolerance
         self._repairs: tuple[wp.Kernel, ...] = ()
         if repair is not None:
-            kinds = discretization.element_kind, GeneralElements
+            kinds = self._kind, GeneralElements
             of_subtrees = repair_own if repair is robust_own_stress else repair_flagged(Material, repair)
             self._repairs = of_subtrees, *(repair_forces(kind, Material, repair) for kind in kinds)
         self._dilating: Dilating | None = None
@@ -263,7 +264,7 @@ class SimdForces:
         if self._dilating is not None or shares or (plan.kinds and not len(plan.flat)):
             return
         general = plan.flat.general or elements
-        if isinstance(general, ForestElements):
+        if general is elements and self._kind is ForestElements:
             general = as_general(elements, rest_matrices, [elements])
         repair = self._repairs[1] if self._repairs else None
         self._lanes = Lanes(elements, general, scatter=self._of_elements, repair=repair)
