@@ -169,8 +169,8 @@ def fill_flat(
     for k in range(wp.tid(), plan.worlds * places, threads):
         world = k / places
         in_world = k - world * places
-        # Padding refers to leaves that are padding.
-        i = tree.leaf_count[0] + k % SINKS
+        # Padding refers to the last leaves, which are always padding.
+        i = tree.leaf_tets.shape[0] - SINKS + k % SINKS
         if in_world < plan.counts[row]:
             i = plan.flat[in_world] + world * plan.world_leaves
         if world > 0 or in_world >= plan.counts[row]:
