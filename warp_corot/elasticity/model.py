@@ -60,10 +60,15 @@ class Kept(Generic[S]):
 
     def __call__(self, *values: object) -> S:
         if self._made is None or any(a is not b for a, b in zip(values, self._values, strict=True)):
-            self._values, self._made = values, self._Struct()
-            for name, value in zip(self._fields, values, strict=True):
-                setattr(self._made, name, value)
+            self._values, self._made = values, self.made(*values)
         return self._made
+
+    def made(self, *values: object) -> S:
+        """A new one."""
+        made = self._Struct()
+        for name, value in zip(self._fields, values, strict=True):
+            setattr(made, name, value)
+        return made
 
 
 #: The fields of materials.
