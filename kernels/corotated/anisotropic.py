@@ -94,38 +94,25 @@ def orthotropic_cauchy(g: wp.mat33, m: wp.mat33, r: wp.mat33, c: vec9, mu: float
     ...
 
 
-@functools.cache
-def listed_stress(rotation: wp.Function) -> wp.Function:
-    """Stress of element k of a list that has the material and activation of the mesh's element t, each with its own
-    rotation; elastic and active stress together."""
-
-    @wp.func
-    def listed_stress(elements: Any, k: int, material: FibreMaterial, t: int, u: wp.array[wp.vec4]):
-        passive = material.passive
-        i = t * passive.stride
-        m = axes_of(passive, t)
-        g, turn = material_gradient(elements, k, m, u)
-        p = orthotropic_stress(g, m, rotation(m + g), passive.stiffness[i], passive.mu[i], passive.lam[i])
-        if material.is_active != 0:
-            # s (F d) d^T, and d is the first axis.
-            pull = material.activation[t] * column(m + g, 0)
-            p += wp.outer(pull, wp.vec3(1.0, 0.0, 0.0))
-        return (filled(passive, t) * p) * wp.transpose(turn)
-
-    return listed_stress
-
-
 # --- the law, for the kernels of ``elements.forces`` ------------------------------------------------------------------
 
 
 @functools.cache
 def fibre_stress(rotation: wp.Function) -> wp.Function:
     """Elastic and active stress, with the element's own rotation."""
-    stress = listed_stress(rotation)
 
     @wp.func
     def fibre_stress(elements: Any, t: int, material: FibreMaterial, u: wp.array[wp.vec4]):
-        return stress(elements, t, material, t, u)
+        passive = material.passive
+        i = t * passive.stride
+        m = axes_of(passive, t)
+        g, turn = material_gradient(elements, t, m, u)
+        p = orthotropic_stress(g, m, rotation(m + g), passive.stiffness[i], passive.mu[i], passive.lam[i])
+        if material.is_active != 0:
+            # s (F d) d^T, and d is the first axis.
+            pull = material.activation[t] * column(m + g, 0)
+            p += wp.outer(pull, wp.vec3(1.0, 0.0, 0.0))
+        return (filled(passive, t) * p) * wp.transpose(turn)
 
     return fibre_stress
 

@@ -113,7 +113,7 @@ def has_stretch(a: wp.mat33) -> bool:
     ...
 
 
-closed_stress, _differential, closed_energy = law_functions("corot::Corotated{}")
+closed_stress, _differential, closed_energy = law_functions("corotated")
 
 
 @wp.func

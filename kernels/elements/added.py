@@ -138,7 +138,7 @@ def relax_simd8(Elements: type) -> wp.Kernel:
     """Make the state at displacements u, after a step of the clock's length, the known one; a thread is eight
     elements."""
 
-    traversal = "ForestEight" if Elements is ForestElements else "ListableGeneralEight"
+    traversal = "ForestEight" if Elements is ForestElements else "GeneralEight"
 
     @wp.func_native(on_cpu(f"corot::relax_eight<corot::{traversal}>(material, units, block, count, u, time);"))
     def eight_elements(

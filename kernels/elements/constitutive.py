@@ -8,7 +8,12 @@ direction dA, which has the digits of dA. Stresses in Pa, energy densities in J/
 No law subtracts numbers near one: each is written in A, so that its stress has float32's digits at any strain.
 """
 
+import functools
+from typing import NamedTuple
+
 import warp as wp
+
+from .simd8 import IsotropicLaw, bare
 
 wp.set_module_options({"enable_backward": False})
 
@@ -67,26 +72,29 @@ def green_strain(a: wp.mat33):
 # --- laws of ``native/laws.h`` ---------------------------------------------------------------------------------------
 
 
-def law_functions(law: str) -> tuple[wp.Function, wp.Function, wp.Function]:
-    """A law, an expression in C++, as device functions: P of (A, mu, lambda), dP of (A, dA, mu, lambda), and the energy
-    density of (A, mu, lambda). The modules of kernels that call them need ``simd8.LAW_HEADERS``.
-    """
+class LawFunctions(NamedTuple):
+    """P of (A, mu, lambda), dP of (A, dA, mu, lambda), and the energy density of (A, mu, lambda)."""
 
-    @wp.func_native(f"wp::mat33 p;\ncorot::stress_of({law}, a, mu, lam, p);\nreturn p;")
+    stress: wp.Function
+    differential: wp.Function
+    energy: wp.Function
+
+
+@functools.cache
+def law_functions(law: IsotropicLaw) -> LawFunctions:
+    """The device functions of a law. The modules of kernels that call them need ``simd8.LAW_HEADERS``."""
+    code = bare(law).code
+
+    @wp.func_native(f"wp::mat33 p;\ncorot::stress_of({code}, a, mu, lam, p);\nreturn p;")
     def stress(a: wp.mat33, mu: float, lam: float) -> wp.mat33: ...
 
-    @wp.func_native(f"wp::mat33 p, dp;\ncorot::stress_of({law}, a, da, mu, lam, p, dp);\nreturn dp;")
+    @wp.func_native(f"wp::mat33 p, dp;\ncorot::stress_of({code}, a, da, mu, lam, p, dp);\nreturn dp;")
     def differential(a: wp.mat33, da: wp.mat33, mu: float, lam: float) -> wp.mat33: ...
 
-    @wp.func_native(f"return corot::energy_of({law}, a, mu, lam);")
+    @wp.func_native(f"return corot::energy_of({code}, a, mu, lam);")
     def energy(a: wp.mat33, mu: float, lam: float) -> float: ...
 
-    return stress, differential, energy
-
-
-linear_stress, linear_differential, linear_energy = law_functions("corot::Linear{}")
-stvk_stress, stvk_differential, stvk_energy = law_functions("corot::StVenantKirchhoff{}")
-neo_hookean_stress, neo_hookean_differential, neo_hookean_energy = law_functions("corot::NeoHookean{}")
+    return LawFunctions(stress, differential, energy)
 
 
 @wp.func_native("float excess;\nconst float log = corot::log_of(d, excess);\nreturn wp::vec2(log, excess);")

@@ -12,53 +12,18 @@ import warp as wp
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial
 from warp_corot.kernels.elements.dilatation import MOST, Dilatation
 from warp_corot.kernels.elements.elements import ForestElements, GeneralElements, frame, gradient_of, rest_volume
-from warp_corot.kernels.elements.simd8 import IsotropicLaw, NativeLaw, elastic, headers, on_cpu, scatter_simd8
+from warp_corot.kernels.elements.simd8 import IsotropicLaw, NativeLaw, elastic, headers, scatter_simd8
 from warp_corot.kernels.modules import unique_kernel
 
 wp.set_module_options({"enable_backward": False})
 
 
 @functools.cache
-def scatter_law_elements(law: IsotropicLaw) -> wp.Kernel:
-    """Forces of general elements under an isotropic law; a thread is eight of them. Elements left out are listed."""
-    of_law = elastic(law)
-    call = f"corot::scatter_general({of_law.code}, units, block, count, u, f, missed)"
-    return scatter_simd8(call, GeneralElements, IsotropicMaterial, wp.int32, headers("elements8", of_law.header))
-
-
-@functools.cache
-def scatter_listed_elements(Elements: type, Material: type, law: NativeLaw) -> wp.Kernel:
-    """The same of elements of either kind under any law, or of those on a list if it is not empty."""
-    traversal = "ForestEight" if Elements is ForestElements else "ListableGeneralEight"
-    arguments = f"{law.code}, elements, block, count, listed, u, f, missed"
-
-    @wp.func_native(on_cpu(f"corot::scatter_listed<corot::{traversal}>({arguments});"))
-    def eight_elements(
-        elements: Elements,
-        block: int,
-        count: int,
-        listed: wp.array[wp.int32],
-        material: Material,
-        u: wp.array[wp.vec4],
-        f: wp.array[wp.vec4],
-        missed: wp.array[wp.int32],
-    ): ...
-
-    @unique_kernel(native=headers("elements8", law.header))
-    def scatter_listed_elements(
-        # In
-        elements: Elements,
-        count: int,
-        listed: wp.array[wp.int32],
-        material: Material,
-        u: wp.array[wp.vec4],
-        # Out
-        f: wp.array[wp.vec4],
-        missed: wp.array[wp.int32],
-    ):
-        eight_elements(elements, wp.tid(), count, listed, material, u, f, missed)
-
-    return scatter_listed_elements
+def scatter_elements(law: NativeLaw, Material: type) -> wp.Kernel:
+    """Forces of general elements under a law; a thread is eight of them. Elements left out are listed by their numbers
+    in the mesh."""
+    call = f"corot::scatter_general({law.code}, units, block, count, u, f, missed)"
+    return scatter_simd8(call, GeneralElements, Material, wp.int32, headers("elements8", law.header))
 
 
 @wp.func

@@ -204,14 +204,14 @@ def measure_elements(Elements: type, of: Dilatation) -> wp.Kernel:
         # Out
         shared: wp.array[wp.vec4],
     ):
-        t = wp.tid()
-        if not is_live(live, t):
+        if not is_live(live, wp.tid()):
             return
+        t = place_of(places, wp.tid())
         theta, slope = measure(own_gradient(elements, t, u))
         change = float(0.0)
         if p.shape[0] > 0:
             change = wp.ddot(slope, own_gradient(elements, t, p))
-        shared[place_of(places, t)] = wp.vec4(theta, change, 0.0, 0.0)
+        shared[t] = wp.vec4(theta, change, 0.0, 0.0)
 
     return measure_elements
 
@@ -289,12 +289,11 @@ def scatter_pressures(Elements: type, of: Dilatation) -> wp.Kernel:
         # Out
         f: wp.array[wp.vec4],
     ):
-        t = wp.tid()
-        if not is_live(live, t):
+        if not is_live(live, wp.tid()):
             return
-        place = place_of(places, t)
-        lam = material.lam[place * material.stride]
-        stress = pressure_stress(own_gradient(elements, t, u), shared[place][1], lam)
+        t = place_of(places, wp.tid())
+        lam = material.lam[t * material.stride]
+        stress = pressure_stress(own_gradient(elements, t, u), shared[t][1], lam)
         scatter(elements, elements.targets[t], t, stress, f)
 
     return scatter_pressures

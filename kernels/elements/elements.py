@@ -54,6 +54,7 @@ class GeneralElements:
     targets: wp.array[wp.vec4i]  # [T] as in ForestElements
     rest_inverse: wp.array[wp.mat33]  # [T] inverse of the matrix of rest edges (x1-x0, x2-x0, x3-x0) [1/m]
     volume: wp.array[wp.float32]  # [T] rest volume [m^3]
+    numbers: wp.array[wp.int32]  # [T] which of a mesh's elements they are; empty: all of them (CPU)
 
 
 @wp.func_native("""
@@ -106,8 +107,14 @@ def root_of(subtrees: Subtrees, s: int):
 
 
 @wp.func
+def edge_of(elements: ForestElements, code: int):
+    """The edge length of elements of a shape code [m]."""
+    return elements.size[(code & LEVEL_MASK) // 3]
+
+
+@wp.func
 def edge_length(elements: ForestElements, t: int):
-    return elements.size[(elements.code[t] & LEVEL_MASK) // 3]
+    return edge_of(elements, elements.code[t])
 
 
 @wp.func
@@ -139,17 +146,21 @@ def node_displacements(nodes: wp.vec4i, u: wp.array[wp.vec4]):
 
 
 @wp.func
-def gradient_of(elements: ForestElements, t: int, u0: wp.vec3, u1: wp.vec3, u2: wp.vec3, u3: wp.vec3):
+def gradient_of_code(elements: ForestElements, code: int, u0: wp.vec3, u1: wp.vec3, u2: wp.vec3, u3: wp.vec3):
     """G = (du/dX) Q [3, 3] of nodal displacements: sums and differences by type, divided by the edge length."""
-    code = elements.code[t]
     shape = shape_of(code)
     c0, c1, c2 = columns0(u0, u1, u2, u3)
     if shape == 1:
         c0, c1, c2 = columns1(u0, u1, u2, u3)
     elif shape == 2:
         c0, c1, c2 = columns2(u0, u1, u2, u3)
-    inv_h = 1.0 / edge_length(elements, t)
+    inv_h = 1.0 / edge_of(elements, code)
     return wp.matrix_from_cols(c0 * inv_h, c1 * inv_h, c2 * (inv_h * mirror_sign(code)))
+
+
+@wp.func
+def gradient_of(elements: ForestElements, t: int, u0: wp.vec3, u1: wp.vec3, u2: wp.vec3, u3: wp.vec3):
+    return gradient_of_code(elements, elements.code[t], u0, u1, u2, u3)
 
 
 @wp.func

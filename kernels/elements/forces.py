@@ -175,6 +175,26 @@ def scatter_forces(Elements: type, Material: type, stress: wp.Function, kernel: 
 
 
 @functools.cache
+def scatter_chosen(Elements: type, Material: type, stress: wp.Function) -> wp.Kernel:
+    """The same of some of the elements; a thread is one of these."""
+
+    @law_kernel()
+    def scatter_chosen(
+        # In
+        elements: Elements,
+        chosen: wp.array[wp.int32],
+        material: Material,
+        u: wp.array[wp.vec4],
+        # Out
+        f: wp.array[wp.vec4],
+    ):
+        t = chosen[wp.tid()]
+        scatter_stress(elements, t, stress(elements, t, material, u), f)
+
+    return scatter_chosen
+
+
+@functools.cache
 def repair_forces(Elements: type, Material: type, stress: wp.Function) -> wp.Kernel:
     """The same for the elements on a list (their number, then their indices), by one thread, which empties the list."""
 

@@ -52,24 +52,23 @@ template <class Units, class Code> COROT_INLINE lanes8 edge_of(const Units& unit
     return gather_one([&](int lane) { return &units.size.data[(code(lane) & LEVEL_MASK) / 3]; });
 }
 
-// Eight elements from ``first`` on, or, if LISTABLE, of a list of them; those past the last of ``count`` are the last one
-// again.
-template <class Units_, bool LISTABLE> struct Eight {
+// Eight elements from ``first`` on; those past the last before ``stop`` are the last one again. ``numbers`` has the places of
+// their values in the arrays of a material; without it these have the same places.
+template <class Units_> struct Eight {
     typedef lanes8 N;
     const Units_& units;
     const int first, last, end;
-    const bool is_row;
-    int numbers[8];
-    COROT_INLINE Eight(const Units_& units, int first, int count, const int* listed)
-        : units(units), first(first), last(count - 1), end(least_of(8, count - first)), is_row(end == 8 && !listed) {
-        for (int lane = 0; LISTABLE && lane < 8; ++lane) {
-            const int k = least_of(first + lane, last);
-            numbers[lane] = listed ? listed[k] : k;
-        }
+    const int* const numbers;
+    COROT_INLINE Eight(const Units_& units, int first, int stop, const int* numbers = nullptr)
+        : units(units), first(first), last(stop - 1), end(least_of(8, stop - first)), numbers(numbers) {}
+    COROT_INLINE int place(int lane) const { return least_of(first + lane, last); }
+    COROT_INLINE int element(int lane) const { return numbers ? numbers[place(lane)] : place(lane); }
+    // One of a value for each place.
+    COROT_INLINE lanes8 placed(const float* values) const {
+        return end == 8 ? load8(values + first) : gather_one([&](int lane) { return values + place(lane); });
     }
-    COROT_INLINE int element(int lane) const { return LISTABLE ? numbers[lane] : least_of(first + lane, last); }
     COROT_INLINE lanes8 values_of(const float* values) const {
-        return is_row ? load8(values + first) : gather_one([&](int lane) { return values + element(lane); });
+        return numbers ? gather_one([&](int lane) { return values + numbers[place(lane)]; }) : placed(values);
     }
     template <class Values> COROT_INLINE lanes8 value(const Values& values, int stride) const {
         return stride ? values_of(values.data) : spread<lanes8>(values.data[0]);
@@ -83,14 +82,14 @@ template <class Units_, bool LISTABLE> struct Eight {
     // Vectors of the four nodes.
     template <class Vectors> COROT_INLINE void gather_nodes(const Vectors& vectors, triple<lanes8>* x) const {
         for (int n = 0; n < 4; ++n)
-            x[n] = gather_vector([&](int lane) { return &vectors.data[units.nodes.data[element(lane)][n]][0]; });
+            x[n] = gather_vector([&](int lane) { return &vectors.data[units.nodes.data[place(lane)][n]][0]; });
     }
     // Adds forces at the four nodes, one element after the other.
     template <class Vectors> COROT_INLINE void add_forces(const triple<lanes8>* force, const Vectors& f) const {
         packed4 parts[8][4];
         for (int n = 0; n < 4; ++n) part(force[n], &parts[0][n], 4);
         for (int lane = 0; lane < end; ++lane) {
-            const auto& to = units.nodes.data[element(lane)];
+            const auto& to = units.nodes.data[place(lane)];
             for (int n = 0; n < 4; ++n) add4(&f.data[to[n]][0], parts[lane][n]);
         }
     }
@@ -103,13 +102,13 @@ template <class Units_, bool LISTABLE> struct Eight {
 };
 
 // General elements, by their rest matrices b.
-template <class Units, bool LISTABLE = false> struct GeneralEight : Eight<Units, LISTABLE> {
+template <class Units> struct GeneralEight : Eight<Units> {
     RestAxes<lanes8> frame;
     lanes8 b[9], volume;
-    COROT_INLINE GeneralEight(const Units& units, int first, int count, const int* listed = nullptr)
-        : Eight<Units, LISTABLE>(units, first, count, listed) {
-        gather_matrix([&](int lane) { return units.rest_inverse.data[this->element(lane)].data[0]; }, b);
-        volume = this->values_of(units.volume.data);
+    COROT_INLINE GeneralEight(const Units& units, int first, int stop)
+        : Eight<Units>(units, first, stop, units.numbers.shape[0] ? units.numbers.data : nullptr) {
+        gather_matrix([&](int lane) { return units.rest_inverse.data[this->place(lane)].data[0]; }, b);
+        volume = this->placed(units.volume.data);
     }
     COROT_INLINE lanes8 weight() const { return -volume; }
     COROT_INLINE void columns(const triple<lanes8>* x, triple<lanes8>* a) const {
@@ -122,24 +121,18 @@ template <class Units, bool LISTABLE = false> struct GeneralEight : Eight<Units,
     }
 };
 
-template <class Units> using ListableGeneralEight = GeneralEight<Units, true>;
-
 // Elements of a forest.
-template <class Units> struct ForestEight : Eight<Units, true> {
+template <class Units> struct ForestEight : Eight<Units> {
     Frame<lanes8> frame;
     lanes8 h;
     masks8 is_1, is_2;
-    COROT_INLINE ForestEight(const Units& units, int first, int count, const int* listed = nullptr)
-        : Eight<Units, true>(units, first, count, listed) {
-        const auto code = [&](int lane) { return units.code.data[this->element(lane)]; };
+    COROT_INLINE ForestEight(const Units& units, int first, int stop) : Eight<Units>(units, first, stop) {
+        const auto code = [&](int lane) { return units.code.data[this->place(lane)]; };
         frame = frame_of(units, code);
         h = edge_of(units, code);
         masks8 shape;
         for (int lane = 0; lane < 8; ++lane) shape[lane] = (code(lane) & LEVEL_MASK) % 3;
         is_1 = shape == 1, is_2 = shape == 2;
-    }
-    COROT_INLINE lanes8 weight() const {
-        return h * h * (is_2 ? spread<lanes8>(VOLUME[2]) : is_1 ? spread<lanes8>(VOLUME[1]) : spread<lanes8>(VOLUME[0]));
     }
     COROT_INLINE void columns(const triple<lanes8>* x, triple<lanes8>* a) const {
         triple<lanes8> a1[3], a2[3];
@@ -148,13 +141,6 @@ template <class Units> struct ForestEight : Eight<Units, true> {
         shape_columns<2>(x[0], x[1], x[2], x[3], a2);
         const lanes8 inverse = 1.0f / h;
         for (int j = 0; j < 3; ++j) a[j] = chosen(is_2, a2[j], chosen(is_1, a1[j], a[j])) * inverse;
-    }
-    COROT_INLINE void forces_of(const triple<lanes8>* p, triple<lanes8>* force) const {
-        triple<lanes8> of1[4], of2[4];
-        shape_forces<0>(p, force);
-        shape_forces<1>(p, of1);
-        shape_forces<2>(p, of2);
-        for (int n = 0; n < 4; ++n) force[n] = chosen(is_2, of2[n], chosen(is_1, of1[n], force[n]));
     }
 };
 
@@ -181,14 +167,6 @@ template <class Units, class Law, class Vectors, class List>
 COROT_INLINE void scatter_general(const Law& law, const Units& units, int block, int count, const Vectors& u, const Vectors& f,
         const List& missed) {
     scatter_eight(GeneralEight<Units>(units, 8 * block, count), law, u, f, missed);
-}
-
-// The same of either kind of elements, or of those on a list if it is not empty.
-template <template <class> class Traversal, class Units, class Law, class List, class Vectors>
-COROT_INLINE void scatter_listed(const Law& law, const Units& units, int block, int count, const List& listed, const Vectors& u,
-        const Vectors& f, const List& missed) {
-    const int* const chosen = listed.shape[0] ? listed.data : nullptr;
-    scatter_eight(Traversal<Units>(units, 8 * block, count, chosen), law, u, f, missed);
 }
 
 // The same where nodes have positions x in the place of displacements.

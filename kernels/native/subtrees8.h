@@ -84,13 +84,6 @@ template <class Type, class Units_> struct EightSubtrees {
             for (int k = 0; k < 10; ++k) add4(&f.data[node[k]][0], parts[lane][k]);
         }
     }
-    // Puts leaves that were left out on a list: how many, then which.
-    template <class List> COROT_INLINE void list_invalid(const masks8& degenerate, const List& list) const {
-        if (!any(degenerate)) return;
-        for (int lane = 0; lane < end; ++lane)
-            for (int number = 0; number < 8; ++number)
-                if (degenerate[lane] >> number & 1) list.data[++list.data[0]] = starts[lane] + number;
-    }
     // Says which leaves were left out, a byte a subtree.
     template <class Bytes> COROT_INLINE void flag(const masks8& degenerate, const Bytes& flags) const {
         for (int lane = 0; lane < end; ++lane) flags.data[first + lane] = static_cast<unsigned char>(degenerate[lane]);
@@ -114,10 +107,10 @@ COROT_INLINE void add_leaves(const Subtrees& subtrees, const Law& law, const mas
     }
 }
 
-// Forces of eight subtrees under a law; leaves that are left out are flagged or LISTED, if the law leaves any out (SOME).
-template <class Type, bool SOME, bool LISTED, class Law, class Units, class Vectors, class Missed>
+// Forces of eight subtrees under a law; leaves that are left out are flagged, if the law leaves any out (SOME).
+template <class Type, bool SOME, class Law, class Units, class Vectors, class Bytes>
 COROT_INLINE void scatter_subtrees(Law law, const Units& units, int block, int count, const Vectors& u, const Vectors& f,
-        const Missed& missed) {
+        const Bytes& flags) {
     const EightSubtrees<Type, Units> subtrees(units, block, count, u);
     triple<lanes8> g[10];
     for (int k = 0; k < 10; ++k) g[k] = nothing<lanes8>();
@@ -125,8 +118,7 @@ COROT_INLINE void scatter_subtrees(Law law, const Units& units, int block, int c
     law.begin(subtrees);
     add_leaves(subtrees, law, masks8{}, g, degenerate);
     subtrees.add_forces(g, f);
-    if constexpr (SOME && LISTED) subtrees.list_invalid(degenerate, missed);
-    if constexpr (SOME && !LISTED) subtrees.flag(degenerate, missed);
+    if constexpr (SOME) subtrees.flag(degenerate, flags);
 }
 
 // --- corotated forces of all leaves with one rotation -----------------------------------------------------------------

@@ -25,11 +25,11 @@ COROT_INLINE void turn_gradients(const Units& units, int block, int count, const
 }
 
 // Elements whose turned gradients are kept; forces are minus the product.
-template <class Units> struct KeptEight : Eight<Units, false> {
+template <class Units> struct KeptEight : Eight<Units> {
     RestAxes<lanes8> frame;
     const float* kept;
     COROT_INLINE KeptEight(const Units& units, int block, int count, const float* kept)
-        : Eight<Units, false>(units, 8 * block, count, nullptr), kept(kept) {}
+        : Eight<Units>(units, 8 * block, count), kept(kept) {}
     COROT_INLINE lanes8 number(int k) const { return load8(kept + 8 * k); }
     COROT_INLINE lanes8 weight() const { return spread<lanes8>(1.0f); }
     COROT_INLINE void columns(const triple<lanes8>* x, triple<lanes8>* a) const {

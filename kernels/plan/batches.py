@@ -10,7 +10,7 @@ from warp_corot.kernels.elements.elements import LEVEL_MASK
 from warp_corot.kernels.tables.shapes import MIRROR_BIT
 
 from .lists import LEAVES_OF_SUBTREE
-from .plan import Plan, Tree, code_above, extent, flat_row, padding, places_t, sink
+from .plan import SINKS, Plan, Tree, code_above, extent, flat_row, places_t, sink
 
 wp.set_module_options({"enable_backward": False})
 
@@ -32,26 +32,16 @@ class Batches:
     node_begin: places_t
     room: places_t
     nodes: wp.array[wp.int32]
-    # As ``Plan.first``; ``roots`` is the place there of the first class that shares its root's rotation.
+    # As ``Plan.first``.
     code: wp.array[wp.int32]  # of the root
     unit: wp.array[wp.int32]  # used by the leaves, if a rotation further up is shared
-    roots: int
-    root_nodes: wp.array[wp.vec4i]  # counted from there
 
 
 @wp.struct
 class FlatLeaves:
-    """Leaves in no subtree, as single elements."""
+    """Leaves in no subtree as general elements, and the tables from which these come; empty on CUDA."""
 
     nodes: wp.array[wp.vec4i]
-    code: wp.array[wp.int32]
-    unit: wp.array[wp.int32]
-    # Their Lamé parameters if these vary, and their rows in ``Plan.values``; else -1.
-    mu: wp.array[wp.float32]
-    lam: wp.array[wp.float32]
-    mu_row: int
-    lam_row: int
-    # Data of general elements, on the CPU, and the tables from which they come.
     rest_inverse: wp.array[wp.mat33]
     volume: wp.array[wp.float32]
     inverse_of: wp.array[wp.mat33]  # [3 * n] by type and frame, of level 0 to 2
@@ -91,16 +81,6 @@ def node_place(c: int, k: int, n: int, batches: Batches):
 def share_place(c: int, k: int, n: int, batches: Batches):
     """The place of the n-th of the five nodes of a group that go with its subtree k of a class."""
     return batches.node_begin[c] + 5 * k + n
-
-
-@wp.func
-def root_nodes(first: int, shape: int, shift: int, tree: Tree, batches: Batches):
-    """The corners of a subtree, the first four of its nodes."""
-    nodes = wp.vec4i(0)
-    for n in range(4):
-        place = batches.places[shape, n]
-        nodes[n] = tree.leaf_tets[first + place[0]][place[1]] + shift
-    return nodes
 
 
 @wp.func
@@ -156,17 +136,13 @@ def fill_batches(
             code = plan.code[first]
             for _ in range(3):
                 code = code_above(code, 0, tree)
-            if kind == 3:
-                batches.root_nodes[place - batches.roots] = root_nodes(first, shape, shift, tree, batches)
-            elif kind > 3:
+            if kind > 3:
                 batches.unit[place] = plan.unit[first] + world * plan.world_units
             if world > 0:
                 plan.first[place] = first + world * plan.world_leaves
         else:
             plan.first[place] = 0
-            if kind == 3:
-                batches.root_nodes[place - batches.roots] = padding(k, tree)
-            elif kind > 3:
+            if kind > 3:
                 batches.unit[place] = 0
         batches.code[place] = code
         if not grouped:
@@ -187,41 +163,23 @@ def fill_flat(
     # Out
     leaves: FlatLeaves,
 ):
-    """Fill the leaves in no subtree."""
+    """List the leaves in no subtree of all worlds but the first, and padding; and fill them in on the CPU."""
     row = flat_row(plan)
     places = extent(row, plan)
     for k in range(wp.tid(), plan.worlds * places, threads):
         world = k / places
         in_world = k - world * places
-        nodes = padding(k, tree)
-        code = tree.padding_code
-        unit = int(0)
-        mu = float(0.0)
-        lam = float(0.0)
+        # Padding refers to the last leaves, which are always padding.
+        i = tree.leaf_tets.shape[0] - SINKS + k % SINKS
         if in_world < plan.counts[row]:
-            i = plan.flat[in_world]
-            shift = world * plan.world_nodes
-            nodes = tree.leaf_tets[i] + wp.vec4i(shift, shift, shift, shift)
+            i = plan.flat[in_world] + world * plan.world_leaves
+        if world > 0 or in_world >= plan.counts[row]:
+            plan.flat[k] = i
+        if leaves.nodes.shape[0] > 0:
             code = plan.code[i]
-            if plan.with_units != 0:
-                unit = plan.unit[i] + world * plan.world_units
-            if leaves.mu_row >= 0:
-                mu = plan.values[leaves.mu_row, i]
-                lam = plan.values[leaves.lam_row, i]
-            if world > 0:
-                plan.flat[k] = i + world * plan.world_leaves
-        else:
-            plan.flat[k] = 0
-        leaves.nodes[k] = nodes
-        leaves.code[k] = code
-        if plan.with_units != 0:
-            leaves.unit[k] = unit
-        if leaves.mu_row >= 0:
-            leaves.mu[k] = mu
-            leaves.lam[k] = lam
-        if leaves.volume.shape[0] > 0:
             level = code & LEVEL_MASK
             # An edge is halved every three levels: exact, and much less work than to compute it again.
             halved = float(1 << (level / 3))
+            leaves.nodes[k] = tree.leaf_tets[i]
             leaves.rest_inverse[k] = halved * leaves.inverse_of[3 * (code >> MIRROR_BIT) + level % 3]
             leaves.volume[k] = leaves.volume_of[level]

@@ -17,7 +17,7 @@ from .batches import (
     share_place,
 )
 from .lists import LEAVES_OF_SUBTREE
-from .plan import Plan, Tree, extent, flat_row, places_t
+from .plan import Plan, Tree, extent, places_t
 
 wp.set_module_options({"enable_backward": False})
 
@@ -35,7 +35,6 @@ class Targets:
     no_node: int
     of_subtrees: wp.array[wp.int32]  # as ``Batches.nodes``
     of_leaves: wp.array[wp.vec4i]  # of all leaves, in a subtree or not
-    of_flat: wp.array[wp.vec4i]
 
 
 @wp.kernel(enable_backward=False)
@@ -94,16 +93,13 @@ def target_flat(
 ):
     """Number the slots of the leaves in no subtree."""
     world, k = wp.tid()
-    count = plan.counts[flat_row(plan)]
     start = targets.begin[plan.classes] + 4 * k
     i = plan.flat[k]
     if world == 0:
         for n in range(4):
             targets.nodes[start + n] = tree.leaf_tets[i][n]
     start += world * targets.per_world
-    own = wp.vec4i(start, start + 1, start + 2, start + 3)
-    targets.of_leaves[world * plan.world_leaves + i] = own
-    targets.of_flat[world * count + k] = own
+    targets.of_leaves[world * plan.world_leaves + i] = wp.vec4i(start, start + 1, start + 2, start + 3)
 
 
 @wp.kernel(enable_backward=False)

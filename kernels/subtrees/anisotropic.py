@@ -11,10 +11,10 @@ import functools
 import warp as wp
 
 from warp_corot.kernels.clusters.laws import ActiveMaterial
-from warp_corot.kernels.corotated.anisotropic import FibreMaterial, fibre_stress, filled, listed_stress
+from warp_corot.kernels.corotated.anisotropic import FibreMaterial, fibre_stress, filled
 from warp_corot.kernels.corotated.well_conditioned import definite_law, definite_strain, is_definite, load_axes
-from warp_corot.kernels.elements.elements import ForestElements, scatter_stress
-from warp_corot.kernels.elements.simd8 import law_kernel
+from warp_corot.kernels.elements.elements import ForestElements
+from warp_corot.kernels.elements.forces import scatter_chosen
 from warp_corot.kernels.math.rotation import ITERATIONS, byers_xu, column, identity3, newton_rotation, quick_rotation
 
 from .cuda import scatter_subtrees
@@ -80,19 +80,4 @@ def scatter_anisotropic_subtrees(
 
 
 repair_leaves = repair_flagged(FibreMaterial, fibre_stress(byers_xu))
-_quick_stress = listed_stress(quick_rotation)
-
-
-@law_kernel()
-def scatter_flat(
-    # In
-    elements: ForestElements,
-    leaves: wp.array[wp.int32],
-    material: FibreMaterial,
-    u: wp.array[wp.vec4],
-    # Out
-    f: wp.array[wp.vec4],
-):
-    """Add the forces of leaves that are in no subtree; ``leaves`` are their places among the mesh's elements."""
-    k = wp.tid()
-    scatter_stress(elements, k, _quick_stress(elements, k, material, leaves[k], u), f)
+scatter_flat = scatter_chosen(ForestElements, FibreMaterial, fibre_stress(quick_rotation))

@@ -104,14 +104,12 @@ _DILATING = "corot::dilating<corot::{}>({}, material.lam, material.isotropic.str
 
 
 @functools.cache
-def scatter_subtrees(shape: int, Material: type, law: NativeLaw, missed_type: type = wp.uint8) -> wp.Kernel:
-    """Forces of subtrees under a law, each leaf on its own; a thread is eight subtrees. Leaves that are left out are
-    flagged, or listed by their numbers in the mesh (int32)."""
-    listed = missed_type is wp.int32
-    kind = f"corot::Type, {int(law.leaves_out)}, {int(listed)}"
+def scatter_subtrees(shape: int, Material: type, law: NativeLaw) -> wp.Kernel:
+    """Forces of subtrees under a law, each leaf on its own; a thread is eight subtrees. Leaves left out are flagged."""
+    kind = f"corot::Type, {int(law.leaves_out)}"
     call = f"corot::scatter_subtrees<{kind}>({law.code}, {_UNITS}, u, f, missed)"
     native = headers("subtrees8", law.header, types=subtree_type(shape))
-    return scatter_simd8(call, Subtrees, Material, missed_type, native)
+    return scatter_simd8(call, Subtrees, Material, wp.uint8, native)
 
 
 def scatter_law_subtrees(shape: int, law: IsotropicLaw = "corotated", shared: Dilatation | None = None) -> wp.Kernel:

@@ -16,16 +16,15 @@ from typing import Any
 import warp as wp
 
 from warp_corot.kernels.corotated.corotated import stretch_stress
-from warp_corot.kernels.elements.constitutive import IsotropicMaterial, RotatedMaterial, linear_stress
+from warp_corot.kernels.elements.constitutive import IsotropicMaterial, RotatedMaterial, law_functions
 from warp_corot.kernels.elements.dilatation import Dilatation
 from warp_corot.kernels.elements.elements import (
     ForestElements,
     Subtrees,
     add_four_forces,
     frame,
-    gradient_of,
+    local_gradient,
     nodal_forces,
-    node_displacements,
     root_of,
 )
 from warp_corot.kernels.elements.simd8 import law_kernel
@@ -154,11 +153,10 @@ def scatter_dilatation(shape: int, grouped: bool, uniform: bool, of: Dilatation)
 
 def scatter_subtrees_shared(shape: int, grouped: bool, uniform: bool, given: bool, listed: bool) -> wp.Kernel:
     """Corotated forces of subtrees whose leaves share a rotation: that of the subtree's root, or a given one."""
-    leaves, missed = isotropic_leaves(shape, always_trusted(linear_stress)), "list" if listed else "flags"
-    turn, missed, resident = shared_turn(shape, given), "" if given else missed, 0 if given else 7
-    return scatter_subtrees(
-        shape, grouped, uniform, leaves, RotatedMaterial, missed=missed, resident=resident, turn=turn
-    )
+    leaves, turn = isotropic_leaves(shape, always_trusted(law_functions("linear").stress)), shared_turn(shape, given)
+    missed, resident = ("", 0) if given else ("list" if listed else "flags", 7)
+    options: dict[str, Any] = {"missed": missed, "resident": resident, "turn": turn}
+    return scatter_subtrees(shape, grouped, uniform, leaves, RotatedMaterial, **options)
 
 
 # --- all of a body in one launch ------------------------------------------------------------------------------------
@@ -209,7 +207,7 @@ def scatter_body(uniform: bool) -> wp.Kernel:
     def scatter_body(
         # In
         ranges: wp.array[WorkRange],
-        flat: ForestElements,
+        elements: ForestElements,
         flat_leaves: wp.array[wp.int32],
         material: IsotropicMaterial,
         u: wp.array[wp.vec4],
@@ -226,19 +224,17 @@ def scatter_body(uniform: bool) -> wp.Kernel:
             return
         shape = ranges[k].shape
         if shape == FLAT:
-            m = int(0)
-            if wp.static(not uniform):
-                m = flat_leaves[s]
-            u0, u1, u2, u3 = node_displacements(flat.nodes[s], u)
+            t = flat_leaves[s]
+            m = wp.where(wp.static(uniform), 0, t)
             p, trusted = leaf_stress(
-                gradient_of(flat, s, u0, u1, u2, u3), frame(flat, s), material.mu[m], material.lam[m]
+                local_gradient(elements, t, u), frame(elements, t), material.mu[m], material.lam[m]
             )
             if not trusted:
                 p = wp.mat33()
             reserved = reserve(degenerate, list_of(block), not trusted, ranges[k].count - s)
-            f0, f1, f2, f3 = nodal_forces(flat, s, p)
-            add_neighbours(f, flat.targets[s], f0, f1, f2, f3)
-            append(degenerate, list_of(block), reserved, flat_leaves[s], wp.where(trusted, 0, 1), ranges[k].count - s)
+            f0, f1, f2, f3 = nodal_forces(elements, t, p)
+            add_neighbours(f, elements.targets[t], f0, f1, f2, f3)
+            append(degenerate, list_of(block), reserved, t, wp.where(trusted, 0, 1), ranges[k].count - s)
             return
         subtrees = ranges[k].subtrees
         grouped = ranges[k].grouped != 0

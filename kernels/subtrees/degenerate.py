@@ -14,15 +14,18 @@ from warp_corot.kernels.elements.elements import (
     GeneralElements,
     add_four_forces,
     frame,
+    gradient_of_code,
     local_gradient,
     nodal_forces,
+    node_displacements,
     scatter_stress,
+    shape_of,
 )
-from warp_corot.kernels.elements.forces import repair_forces
 from warp_corot.kernels.elements.simd8 import LAW_HEADERS, law_kernel
 from warp_corot.kernels.math.matrices import identity3
 from warp_corot.kernels.math.rotation import rotation_out_of_line
 from warp_corot.kernels.modules import unique_kernel
+from warp_corot.kernels.tables.shapes import FRAME_SHIFT
 
 wp.set_module_options({"enable_backward": False, "extra_build_options": LAW_HEADERS})
 
@@ -225,7 +228,7 @@ def stress_out_of_line(w: wp.mat33, mu: float, lam: float):
 
 
 @wp.func
-def own_stress(elements: Any, t: int, material: IsotropicMaterial, u: wp.array[wp.vec4]):
+def robust_own_stress(elements: Any, t: int, material: IsotropicMaterial, u: wp.array[wp.vec4]):
     """First Piola-Kirchhoff stress of element t with its own rotation, times Q, for any F."""
     q = frame(elements, t)
     w = wp.transpose(q) * local_gradient(elements, t, u)
@@ -235,9 +238,16 @@ def own_stress(elements: Any, t: int, material: IsotropicMaterial, u: wp.array[w
 
 
 @wp.func
-def root_rotation(roots: ForestElements, s: int, u: wp.array[wp.vec4]):
-    q = frame(roots, s)
-    return rotation_out_of_line(q + local_gradient(roots, s, u)) * wp.transpose(q)
+def root_rotation(elements: ForestElements, places: wp.array2d[wp.vec2i], first: int, code: int, u: wp.array[wp.vec4]):
+    """The rotation of a subtree as one element of a shape code; ``places`` has the leaf and the node of each of its
+    nodes, by shape."""
+    nodes = wp.vec4i(0)
+    for n in range(4):
+        place = places[shape_of(code), n]
+        nodes[n] = elements.nodes[first + place[0]][place[1]]
+    u0, u1, u2, u3 = node_displacements(nodes, u)
+    q = elements.frames[code >> FRAME_SHIFT]
+    return rotation_out_of_line(q + gradient_of_code(elements, code, u0, u1, u2, u3)) * wp.transpose(q)
 
 
 # --- by a list ------------------------------------------------------------------------------------------------------
@@ -284,7 +294,7 @@ def repair_listed_own(
                 if k < total:
                     t = leaves_of_entries(listed, 0, 0, k)
                     targets = elements.targets[t]
-                    p = own_stress(elements, t, material, u)
+                    p = robust_own_stress(elements, t, material, u)
                 f0, f1, f2, f3 = nodal_forces(elements, t, p)
                 add_pairs(f, targets, f0, f1, f2, f3)
                 k += lanes
@@ -298,7 +308,8 @@ def repair_listed_shared(
     # In
     threads: int,
     first: wp.array[wp.int32],
-    roots: ForestElements,
+    code: wp.array[wp.int32],
+    places: wp.array2d[wp.vec2i],
     elements: ForestElements,
     material: IsotropicMaterial,
     u: wp.array[wp.vec4],
@@ -321,7 +332,8 @@ def repair_listed_shared(
         while i < entry_count(listed, list) * LEAVES:
             s = listed.entries[listed.room * list + i // LEAVES][0]
             t = first[s] + i % LEAVES
-            scatter_turned(elements, t, root_rotation(roots, s, u), material, u, f)
+            r = root_rotation(elements, places, first[s], code[s], u)
+            scatter_turned(elements, t, r, material, u, f)
             i += each_list
         list += at_a_time
     leave(listed, threads // LIST_BLOCK)
@@ -388,7 +400,8 @@ def repair_shared(
     # In
     flagged: wp.array[wp.uint64],
     first: wp.array[wp.int32],
-    roots: ForestElements,
+    code: wp.array[wp.int32],
+    places: wp.array2d[wp.vec2i],
     elements: ForestElements,
     material: IsotropicMaterial,
     u: wp.array[wp.vec4],
@@ -404,7 +417,7 @@ def repair_shared(
     while member < SUBTREES:
         if is_degenerate(flags, LEAVES * member):
             s = SUBTREES * i + member
-            rotation = root_rotation(roots, s, u)
+            rotation = root_rotation(elements, places, first[s], code[s], u)
             leaf = int(0)
             while leaf < LEAVES:
                 t = first[s] + leaf
@@ -413,6 +426,5 @@ def repair_shared(
         member += 1
 
 
-#: Of corotated leaves with own rotations, and of listed general elements.
-repair_own = repair_flagged(IsotropicMaterial, own_stress, functools.partial(wp.kernel, enable_backward=False))
-repair_elements = repair_forces(GeneralElements, IsotropicMaterial, own_stress)
+#: Of corotated leaves with own rotations.
+repair_own = repair_flagged(IsotropicMaterial, robust_own_stress, functools.partial(wp.kernel, enable_backward=False))

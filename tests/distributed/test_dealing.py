@@ -107,10 +107,12 @@ def terms_of(mesh, grouped, elements):
     each."""
     plan = ForcePlan.of_forest(mesh, None, wp.get_device("cpu"), grouped=grouped, deterministic=True)
     given = [(each.subtrees.targets, each.subtrees.first, each.grouped) for each in plan.batches]
-    given += [(plan.flat.elements.targets, plan.flat.leaves, False)] if len(plan.flat) else []
+    flat = plan.flat.leaves.numpy()
+    given = [(targets.numpy(), first.numpy(), of_groups) for targets, first, of_groups in given]
+    given += [(plan.elements.targets.numpy()[flat], flat, False)] if len(flat) else []
     found = {}
-    for targets, firsts, of_groups in given:
-        slots, leaves = targets.numpy(), elements[firsts.numpy()[:: 8 if of_groups else 1]]
+    for slots, firsts, of_groups in given:
+        leaves = elements[firsts[:: 8 if of_groups else 1]]
         for first, row in zip(leaves, slots, strict=True):
             found |= {slot: (int(first), place) for place, slot in enumerate(row.tolist())}
     starts, order = plan.slots.starts.numpy(), plan.slots.order.numpy().tolist()

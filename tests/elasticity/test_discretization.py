@@ -7,7 +7,7 @@ from remesh_cases import CUBE, apply_marks, random_marks
 
 import warp_corot as wc
 from warp_corot.elasticity.model import isotropic_material
-from warp_corot.kernels.elements.constitutive import IsotropicMaterial, stvk_stress
+from warp_corot.kernels.elements.constitutive import IsotropicMaterial, law_functions
 from warp_corot.kernels.elements.forces import law_stress, scatter_forces
 
 MATERIAL = wc.Isotropic(young=1e4, poisson=0.4, density=1000.0)
@@ -41,7 +41,7 @@ def test_forces_by_slots_equal_forces_added_to_nodes(subtrees, general, worlds, 
     plan = body.discretization.plan(subtrees=subtrees, deterministic=True)
     u = random_displacements(body.node_count, body.node_count, rng, device)
     own = body.discretization
-    kernel = scatter_forces(own.element_kind, IsotropicMaterial, law_stress(stvk_stress))
+    kernel = scatter_forces(own.element_kind, IsotropicMaterial, law_stress(law_functions("stvk").stress))
     inputs = [isotropic_material([own.mu, own.lam, own.material_stride]), u]
     expected, found = wp.zeros_like(u), wp.zeros_like(u)
     wp.launch(

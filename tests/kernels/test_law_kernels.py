@@ -15,10 +15,9 @@ from thousands import FORESTS, TOLERANCE, materials, meshed, turned
 
 import warp_corot as wc
 from warp_corot.discretization.planner import ForcePlan
-from warp_corot.elasticity.anisotropic import AnisotropicField, active_material, as_bytes
+from warp_corot.elasticity.anisotropic import ACTIVE, AnisotropicField
 from warp_corot.elasticity.clusters import ClusterScatter, clustered
-from warp_corot.elasticity.laws import law_of
-from warp_corot.elasticity.model import isotropic_material
+from warp_corot.elasticity.model import Kept, isotropic_material
 from warp_corot.kernels.clusters.laws import ActiveMaterial, anisotropic_law, isotropic_law, reinforced_law
 from warp_corot.kernels.corotated.anisotropic import FibreMaterial, ReinforcedMaterial, fibre_stress
 from warp_corot.kernels.corotated.corotated import corotated_stress
@@ -34,9 +33,9 @@ from warp_corot.kernels.subtrees.memory import BLOCK
 from warp_corot.kernels.tables.cluster_layout import ANISOTROPIC
 
 LAWS = {
-    "linear": constitutive.linear_stress,
-    "stvk": constitutive.stvk_stress,
-    "neo_hookean": constitutive.neo_hookean_stress,
+    "linear": constitutive.law_functions("linear").stress,
+    "stvk": constitutive.law_functions("stvk").stress,
+    "neo_hookean": constitutive.law_functions("neo-hookean").stress,
 }
 
 
@@ -133,16 +132,16 @@ def test_anisotropic_subtrees_one_by_one(name, kind, device, rng):
     f, flags, fibres = wp.zeros_like(on_device), 0, with_activation(whole, active)
     for batch in plan.batches:
         by_node(batch.subtrees, body.device)
-        left = wp.zeros(-(-batch.count // 8), dtype=wp.uint64, device=device)
         kernel = scatter_anisotropic_subtrees(batch.shape, False, *options)
-        inputs = [batch.subtrees, active_material(whole.passive, axes, 1, active), on_device]
-        wp.launch(kernel, batch.count, inputs, [f, as_bytes(left), NO_LIST], device=device, block_dim=BLOCK)
+        inputs = [batch.subtrees, Kept(ActiveMaterial, *ACTIVE)(whole.passive, axes, 1, active), on_device]
+        wp.launch(kernel, batch.count, inputs, [f, batch.flagged, NO_LIST], device=device, block_dim=BLOCK)
+        left = batch.flags_by_eights
         inputs = [8, left, batch.subtrees.first, body.discretization.elements, fibres, on_device]
         wp.launch(repair_leaves, 8 * len(left), inputs=inputs, outputs=[f], device=device)
-        flags += np.unpackbits(as_bytes(left).numpy()).sum()
+        flags += np.unpackbits(batch.flagged.numpy()).sum()
     flat = plan.flat
     if len(flat):
-        inputs = [flat.elements, flat.leaves, fibres, on_device]
+        inputs = [plan.elements, flat.leaves, fibres, on_device]
         wp.launch(scatter_flat, len(flat), inputs=inputs, outputs=[f], device=device)
     assert flags < 0.3 * len(mesh.tets)
     assert flags > 0 or name == "mixed levels"
@@ -160,7 +159,7 @@ def test_laws_in_clusters_are_those_leaf_by_leaf(model, name, device, rng):
     given, _ = materials(len(mesh.tets), False, rng)
     law, Material, material = reinforced_law, ReinforcedMaterial, wc.Isotropic(**given)
     if model is OGDEN:
-        law, Material = isotropic_law(law_of(model.terms).stress), IsotropicMaterial
+        law, Material = isotropic_law(constitutive.law_functions(model.terms).stress), IsotropicMaterial
     else:
         along, across, _ = random_axes(rng)
         material = wc.FibreReinforced(k1=1e4, k2=5.0, direction=along, across=across, angle=0.5, kappa=0.1, **given)
@@ -185,7 +184,7 @@ def test_anisotropic_general_elements(kind, device, rng):
     axes = quaternions(field)
     law, chosen = anisotropic_law("muscle" in kind), clustered(body.discretization)
     scatter = ClusterScatter(field.elements, law, ActiveMaterial, chosen=chosen, layout=ANISOTROPIC)
-    add_forces(scatter, active_material(field.passive, axes, 1, active), on_device, f)
+    add_forces(scatter, Kept(ActiveMaterial, *ACTIVE)(field.passive, axes, 1, active), on_device, f)
     assert_right(f.numpy()[:, :3], leaf_by_leaf(field, active, on_device))
 
 

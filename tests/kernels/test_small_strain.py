@@ -13,7 +13,8 @@ from degenerate_launches import Launches
 
 import warp_corot as wc
 from warp_corot.discretization.planner import ForcePlan
-from warp_corot.elasticity.model import isotropic_material, rotated_material
+from warp_corot.elasticity.model import ROTATED, Kept, isotropic_material
+from warp_corot.kernels.elements.constitutive import RotatedMaterial
 from warp_corot.kernels.subtrees.cuda import scatter_subtrees_shared
 from warp_corot.kernels.subtrees.degenerate import DegenerateList
 
@@ -78,7 +79,7 @@ def test_shared_rotations_by_subtrees(leaf_level, amount, device, rng):
     f = wp.zeros_like(body.state.displacements)
     material = isotropic_material([body.discretization.mu, body.discretization.lam, 0])
     none = wp.empty(0, dtype=wp.mat33, device=body.device), wp.empty(0, dtype=wp.int32, device=body.device)
-    material = rotated_material(material, *none)
+    material = Kept(RotatedMaterial, *ROTATED)(material, *none)
     wp.launch(
         scatter_subtrees_shared(batch.shape, False, True, False, False),
         dim=batch.count,

@@ -85,8 +85,6 @@ class Comparison:
             assert np.array_equal(batch.subtrees.first.numpy()[here], expected.subtrees.first.numpy())
             assert np.array_equal(nodes[:rows], by_unit(expected))
             assert_same_shapes(batch.subtrees, expected.subtrees, here, here)
-            if batch.sharing is Sharing.ROOT:
-                assert_same_elements(batch.roots, expected.roots, here, here)
             if batch.sharing is Sharing.ABOVE:
                 own, other = batch.unit.numpy()[here], expected.unit.numpy()
                 assert_same_elements(self.plan.units.elements, self.expected.units.elements, own, other)
@@ -95,8 +93,6 @@ class Comparison:
         assert (nodes[rows:, named:] == -1).all()
         self.assert_exact(batch.subtrees, count)
         assert not batch.subtrees.first.numpy()[count:].any()
-        if batch.sharing is Sharing.ROOT:
-            self.assert_padding(batch.roots, count)
         if batch.sharing is Sharing.ABOVE:
             assert not batch.unit.numpy()[count:].any()
 
@@ -104,19 +100,19 @@ class Comparison:
         flat, expected = self.plan.flat, self.expected.flat
         count, here = len(expected), slice(len(expected))
         assert np.array_equal(flat.leaves.numpy()[here], expected.leaves.numpy())
-        assert_same_elements(flat.elements, expected.elements, here, here)
-        self.assert_padding(flat.elements, count)
-        if flat.material is not None:
-            for name, own in zip(("mu", "lam"), flat.material, strict=True):
-                carried = self.forest.carriage.values(name)[self.forest.leaf_elements]
-                assert np.array_equal(self.plan.values[name].numpy()[: self.leaves], carried)
-                assert not self.plan.values[name].numpy()[self.leaves :].any()
-                assert np.array_equal(own.numpy()[here], carried[expected.leaves.numpy()])
-                assert not own.numpy()[count:].any()
-        if expected.unit is not None:
-            own, other = flat.unit.numpy()[here], expected.unit.numpy()
-            assert_same_elements(self.plan.units.elements, self.expected.units.elements, own, other)
-            assert not flat.unit.numpy()[count:].any()
+        padding = flat.leaves.numpy()[count:]
+        assert (padding >= self.leaves).all()
+        self.assert_sinks(self.plan.elements.nodes.numpy()[padding])
+        if flat.general is not None and count:
+            for name in ("nodes", "rest_inverse", "volume"):
+                own, other = (getattr(each.general, name).numpy()[here] for each in (flat, expected))
+                assert np.array_equal(own, other)
+            assert np.array_equal(flat.general.numbers.numpy(), flat.leaves.numpy())
+            self.assert_sinks(flat.general.nodes.numpy()[count:])
+        for name, own in self.plan.values.items():
+            carried = self.forest.carriage.values(name)[self.forest.leaf_elements]
+            assert np.array_equal(own.numpy()[: self.leaves], carried)
+            assert not own.numpy()[self.leaves :].any()
 
     def check_units(self):
         if self.mesh_units is None:

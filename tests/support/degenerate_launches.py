@@ -44,7 +44,7 @@ class Launches:
             dim=self.blocks * BLOCK,
             inputs=[
                 self.ranges,
-                flat.elements,
+                self.plan.elements,
                 flat.leaves,
                 material,
                 body.state.displacements,

@@ -47,7 +47,7 @@ class OracleUnits:
 
 @dataclass
 class OracleBatch:
-    """Subtrees of one shape and sharing: first leaves, nodes and targets by unit of work, roots' nodes and codes."""
+    """Subtrees of one shape and sharing: first leaves, nodes and targets by unit of work, and codes of roots."""
 
     shape: int
     grouped: bool
@@ -55,7 +55,6 @@ class OracleBatch:
     first: np.ndarray
     nodes: np.ndarray
     targets: np.ndarray
-    root_nodes: np.ndarray
     codes: np.ndarray
     frames: np.ndarray
 
@@ -95,7 +94,6 @@ class OraclePlan:
                     in_worlds(first, worlds, count),
                     in_worlds(own, worlds, nodes),
                     in_worlds(targets, worlds, target_count),
-                    in_worlds(roots, worlds, nodes),
                     np.tile(codes, worlds),
                     frames,
                 )

@@ -20,7 +20,7 @@ from warp_corot.discretization.elements import (
     with_targets,
 )
 from warp_corot.discretization.levels import Levels, TreeNodes
-from warp_corot.discretization.plan import Awaited, FlatLeaves, Plan, Slots
+from warp_corot.discretization.plan import Awaited, Plan, Slots
 from warp_corot.discretization.planner import ForcePlan, pays_in_groups, units_of
 from warp_corot.discretization.sizes import Clock, Sizes
 from warp_corot.errors import InputError
@@ -126,10 +126,6 @@ class Discretization(ABC):
     @abstractmethod
     def anisotropic_material(self) -> OrthotropicMaterial:
         """The anisotropic material for kernels, world after world if it is not uniform."""
-
-    def lame_of_flat(self, flat: FlatLeaves) -> tuple[wp.array, wp.array] | None:
-        """Lamé's parameters for the forces of leaves outside subtrees, if the plan keeps them, else None."""
-        return flat.material
 
     @property
     def is_anisotropic(self) -> bool:
@@ -356,7 +352,7 @@ def deviatoric(whole: Discretization) -> Discretization:
 
 class _Deviatoric:
     def __init__(self, whole: Discretization):
-        self._whole, self._zeros = whole, dict[str, tuple[wp.array, wp.array]]()
+        self._whole, self._zeros = whole, (whole.lam, wp.zeros_like(whole.lam))
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self.__dict__["_whole"], name)
@@ -367,14 +363,6 @@ class _Deviatoric:
 
     @property
     def lam(self) -> wp.array:
-        return self._none_of("all", self._whole.lam)
-
-    def lame_of_flat(self, flat: FlatLeaves) -> tuple[wp.array, wp.array] | None:
-        given = self._whole.lame_of_flat(flat)
-        return None if given is None else (given[0], self._none_of("flat", given[1]))
-
-    def _none_of(self, which: str, lam: wp.array) -> wp.array:
-        known = self._zeros.get(which)
-        if known is None or known[0] is not lam:
-            known = self._zeros[which] = (lam, wp.zeros_like(lam))
-        return known[1]
+        if self._zeros[0] is not self._whole.lam:
+            self._zeros = self._whole.lam, wp.zeros_like(self._whole.lam)
+        return self._zeros[1]

@@ -19,7 +19,7 @@ import warp as wp
 from warp_corot.discretization.elements import Elements, in_worlds
 from warp_corot.errors import InputError
 from warp_corot.inputs.cpu_threads import launch, part_of
-from warp_corot.kernels.elements.elements import ForestElements, GeneralElements, Subtrees, gather_slots
+from warp_corot.kernels.elements.elements import GeneralElements, Subtrees, gather_slots
 from warp_corot.kernels.plan.slots import find_starts, number_slots, order_slots
 
 #: Slots are numbered in 32 bits.
@@ -134,7 +134,6 @@ class Batch:
         count: Number of subtrees.
         sharing: The owner of the rotation that their leaves use.
         subtrees: ``kernels.elements.elements.Subtrees``.
-        roots: Their roots as forest elements if leaves share the root's rotation, else None.
         unit: The one of ``Units`` that each uses if leaves share a rotation from further up, int32 [count], else None.
         flagged: Set by the kernel: bit k of a subtree's byte if its leaf k, in tree order, was left out; uint8
             [count, rounded up to eights].
@@ -146,13 +145,12 @@ class Batch:
     count: int
     sharing: Sharing
     subtrees: Subtrees
-    roots: ForestElements | None
     unit: wp.array | None
     flagged: wp.array
     live: wp.array | None = None
 
     def part(self, begin: int, end: int) -> Batch:
-        """Some of the subtrees, on the CPU; their leaves have own rotations."""
+        """Some of the subtrees, on the CPU; their leaves have own rotations or their root's."""
         flags = wp.zeros(-(-(end - begin) // 8) * 8, dtype=wp.uint8, device="cpu")
         return replace(self, count=end - begin, subtrees=part_of(self.subtrees, begin, end), flagged=flags)
 
@@ -200,22 +198,16 @@ class Units:
 
 @dataclass(frozen=True)
 class FlatLeaves:
-    """Leaves outside subtrees, as single elements, world after world.
+    """Leaves outside subtrees, world after world.
 
     Attributes:
         leaves: Their numbers among the mesh's elements, int32 [n]; ``len`` is the number in one launch.
-        elements: ``kernels.elements.elements.ForestElements``.
-        unit: The one of ``Units`` that each uses if rotations are shared, int32 [n], else None.
-        general: The same leaves as general elements, if these exist, else None.
-        material: Their Lamé parameters mu and lambda [Pa] if these vary and are kept, float32 [n] each, else None.
+        general: The same leaves as general elements, on the CPU; else None.
         live: The number of leaves, if launches cover more, int32 [1] on the device, else None.
     """
 
     leaves: wp.array
-    elements: Elements
-    unit: wp.array | None = None
     general: GeneralElements | None = None
-    material: tuple[wp.array, wp.array] | None = None
     live: wp.array | None = None
 
     def __len__(self) -> int:

@@ -15,15 +15,18 @@ import warp as wp
 from warp_corot.discretization.elements import Elements, device_elements, device_frames, with_targets
 from warp_corot.discretization.plan import GROUPED_LEAVES, Batch, FlatLeaves, Sharing, Slots, Units, check_slots
 from warp_corot.errors import InputError
+from warp_corot.kernels.elements.cpu import rest_matrices
 from warp_corot.kernels.elements.elements import ForestElements, GeneralElements, Subtrees
 from warp_corot.kernels.plan import batches as batch_kernels
 from warp_corot.kernels.plan import lists
 from warp_corot.kernels.plan import lists as unit_kernels
 from warp_corot.kernels.plan import slots as kernels
 from warp_corot.kernels.plan.plan import Plan, Tree, places_t
+from warp_corot.kernels.tables.shapes import MIRROR_BIT
 from warp_corot.kernels.tables.subtree import GROUP_NODES, LEAVES, group_leaves, group_nodes
 from warp_corot.mesh import TetForest
 from warp_corot.mesh.bisection import corner_leaves
+from warp_corot.mesh.lattice import MAX_LEVEL
 from warp_corot.mesh.tree import UniformTree
 
 if TYPE_CHECKING:
@@ -161,7 +164,6 @@ class PlanArrays:
         plan.counts, plan.before = self._zeros(plan.classes + 3), self._zeros(plan.classes + 3)
         plan.code = elements.code
         self.plan, self.batches, self.leaves = plan, batch_kernels.Batches(), batch_kernels.FlatLeaves()
-        self.leaves.mu_row = self.leaves.lam_row = -1
 
     def make(self, room: Room) -> None:
         """Make the arrays.
@@ -191,11 +193,13 @@ class PlanArrays:
         batches.nodes, batches.code = self._empty(node_begin[-1]), self._empty(begin[-1])
         if len(self.kinds) > 3:
             batches.unit = self._empty(begin[-1])
-            batches.roots = begin[3 * plan.members]
-            batches.root_nodes = self._empty(begin[4 * plan.members] - batches.roots, wp.vec4i)
-        flat = room.flat if plan.with_subtrees else 0
-        leaves.nodes, leaves.code = self._empty(flat, wp.vec4i), self._empty(flat)
-        leaves.unit = self._empty(flat if room.units else 0)
+        if self.device.is_cpu and room.flat and plan.with_subtrees:
+            # The CPU computes eight elements at a time, from rest matrices.
+            leaves.nodes, leaves.rest_inverse = (self._empty(room.flat, kind) for kind in (wp.vec4i, wp.mat33))
+            leaves.volume = self._empty(room.flat, wp.float32)
+            codes = (np.arange(2 * len(self._elements_like.frames))[:, None] << MIRROR_BIT) + np.arange(3)
+            leaves.inverse_of, _ = self._rest_matrices(codes.ravel())
+            _, leaves.volume_of = self._rest_matrices(np.arange(MAX_LEVEL + 1))
         self._flagged = wp.zeros(begin[-1], dtype=wp.uint8, device=self.device)
 
     def is_grouped(self, row: int) -> bool:
@@ -221,39 +225,35 @@ class PlanArrays:
         subtrees.targets = subtrees.nodes if targets is None else self._nodes(targets, row, count)
         subtrees.code, subtrees.first = arrays.code[here], self.plan.first[here]
         subtrees.frames, subtrees.size = self._elements_like.frames, self._elements_like.size
-        roots = unit = None
-        if sharing is Sharing.ROOT:
-            first = begin - arrays.roots
-            roots = self.elements(arrays.root_nodes[first : first + count], subtrees.code)
-        elif sharing is Sharing.ABOVE:
-            unit = arrays.unit[here]
+        unit = arrays.unit[here] if sharing is Sharing.ABOVE else None
         flagged = self._flagged[begin : begin + -(-count // 8) * 8]
-        return Batch(shape, self.is_grouped(row), count, sharing, subtrees, roots, unit, flagged)
+        return Batch(shape, self.is_grouped(row), count, sharing, subtrees, unit, flagged)
 
-    def flat(self, count: int, targets: wp.array | None = None) -> FlatLeaves:
-        """The first leaves outside subtrees; ``targets`` as for ``batch``."""
+    def flat(self, count: int) -> FlatLeaves:
+        """The first leaves outside subtrees."""
         leaves, general = self.leaves, None
-        if leaves.volume is not None:
+        if leaves.volume:
             general = GeneralElements()
             general.nodes = general.targets = _first(leaves.nodes, count)
             general.rest_inverse, general.volume = _first(leaves.rest_inverse, count), _first(leaves.volume, count)
-        return FlatLeaves(
-            leaves=_first(self.plan.flat, count),
-            elements=self.elements(_first(leaves.nodes, count), _first(leaves.code, count), targets),
-            unit=_first(leaves.unit, count) if self.plan.with_units else None,
-            general=general,
-            material=(_first(leaves.mu, count), _first(leaves.lam, count)) if leaves.mu_row >= 0 else None,
-        )
+            general.numbers = _first(self.plan.flat, count)
+        return FlatLeaves(_first(self.plan.flat, count), general)
+
+    def _rest_matrices(self, codes: npt.NDArray[np.integer]) -> tuple[wp.array, wp.array]:
+        """Rest matrices and volumes of elements by their codes."""
+        elements = self.elements(self.leaves.nodes, wp.array(codes, dtype=wp.int32, device=self.device))
+        found = self._empty(len(codes), wp.mat33), self._empty(len(codes), wp.float32)
+        wp.launch(rest_matrices, len(codes), [elements], list(found), device=self.device)
+        return found
 
     def units(self, count: int) -> Units:
         """The first units."""
         return Units(self.elements(self.plan.unit_nodes, self.plan.unit_code), count, self.plan.unit)
 
-    def elements(self, nodes: wp.array, code: wp.array, targets: wp.array | None = None) -> ForestElements:
+    def elements(self, nodes: wp.array, code: wp.array) -> ForestElements:
         """Any elements of the forest."""
         elements = ForestElements()
-        elements.nodes, elements.targets = nodes, nodes if targets is None else targets
-        elements.code = code
+        elements.nodes, elements.targets, elements.code = nodes, nodes, code
         elements.frames, elements.size = self._elements_like.frames, self._elements_like.size
         return elements
 
@@ -366,7 +366,6 @@ class SubtreeTargets:
         slots: The slots.
         of_subtrees: The places to which forces of subtrees are added, in the layout of ``made.batches.nodes``.
         of_leaves: The places to which forces of all leaves are added, vec4i [worlds * T].
-        of_flat: The same for leaves outside subtrees.
 
     Raises:
         InputError: There are more slots than can be numbered.
@@ -392,14 +391,13 @@ class SubtreeTargets:
         targets.nodes = wp.empty(2 * per_world, dtype=wp.int32, device=device)
         targets.of_subtrees = wp.empty_like(made.batches.nodes)
         targets.of_leaves = wp.empty_like(elements.nodes)
-        targets.of_flat = wp.empty_like(made.leaves.nodes)
         threads = threads_on(device)
         if any(subtrees):
             inputs = [threads, plan, made.batches]
             wp.launch(kernels.target_subtrees, (plan.classes, threads), inputs, [targets], device=device)
         if flat:
             wp.launch(kernels.target_flat, (worlds, flat), [plan, made.tree], [targets], device=device)
-        self.of_subtrees, self.of_leaves, self.of_flat = targets.of_subtrees, targets.of_leaves, targets.of_flat
+        self.of_subtrees, self.of_leaves = targets.of_subtrees, targets.of_leaves
         self.slots = Slots.of_nodes(targets.nodes, per_world, per_world - unused, plan.world_nodes, worlds)
 
 
@@ -434,7 +432,7 @@ class ForcePlan:
     ) -> ForcePlan:
         """The plan of a field that computes the elements of a mesh one by one."""
         none = wp.empty(0, dtype=wp.int32, device=elements.nodes.device)
-        return cls(elements, (), FlatLeaves(none, elements), slots=slots, find_units=find_units)
+        return cls(elements, (), FlatLeaves(none), slots=slots, find_units=find_units)
 
     @classmethod
     def of_forest(
@@ -475,7 +473,7 @@ class ForcePlan:
         return cls(
             elements if targets is None else with_targets(elements, targets.of_leaves),
             tuple(batches),
-            made.flat(worlds * found.flat, targets and targets.of_flat),
+            made.flat(worlds * found.flat),
             made.units(worlds * found.units) if has_units else None,
             None if targets is None else targets.slots,
             find_units,

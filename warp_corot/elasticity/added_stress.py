@@ -15,7 +15,7 @@ import warp as wp
 from warp_corot.discretization.discretization import Discretization, discretization_of
 from warp_corot.discretization.plan import Plan
 from warp_corot.elasticity.corotated.model import Corotated
-from warp_corot.elasticity.cpu import ByElements
+from warp_corot.elasticity.cpu import SimdForces
 from warp_corot.elasticity.model import ElementMaterial, ForceField, Model, SmallForces
 from warp_corot.elasticity.tangents import ElementTangent, SumTangent, Tangent
 from warp_corot.errors import InputError
@@ -23,7 +23,7 @@ from warp_corot.inputs.arguments import forwards
 from warp_corot.inputs.checks import checked_number, checked_numbers, shown
 from warp_corot.kernels.elements import added as kernels
 from warp_corot.kernels.elements.added import ViscousMaterial, relax_simd8, viscosity_stress
-from warp_corot.kernels.elements.forces import element_energies, element_law
+from warp_corot.kernels.elements.forces import element_energies, element_law, scatter_forces
 from warp_corot.kernels.elements.simd8 import LANES, PRESTRESS, PRONY, VISCOUS, NativeLaw
 
 if TYPE_CHECKING:
@@ -31,6 +31,47 @@ if TYPE_CHECKING:
     from warp_corot.discretization.changing.plan import DevicePlan
     from warp_corot.discretization.discretization import Discretized
     from warp_corot.kernels.stepping.pace import Pace
+
+
+class AddedForces:
+    """Launches that add the forces of a stress in all elements, besides those of a law.
+
+    On the CPU a thread takes eight complete subtrees of the law's plan, or eight other elements, if the plan has
+    subtrees or never changes. Otherwise a thread takes an element; deterministic forces go to slots first.
+
+    Args:
+        discretization: The mesh.
+        law: The law's field.
+        Material: The struct that the stress reads.
+        stress: The stress, as ``kernels.elements.forces`` takes it.
+        native: The same in C++.
+    """
+
+    def __init__(
+        self, discretization: Discretization, law: ForceField, Material: type, stress: wp.Function, native: NativeLaw
+    ):
+        self._law, self._material, plan = law, cast("Any", None), law.plan
+        if law.deterministic:
+            plan = discretization.plan(subtrees=False, deterministic=True)
+        self._elements, self._slots = plan.elements, plan.slots
+        self._kernel = scatter_forces(discretization.element_kind, Material, stress)
+        self._simd: SimdForces | None = None
+        if discretization.device.is_cpu and (plan.kinds or plan.counts is None):
+            repair = stress if native.leaves_out else None
+            self._simd = SimdForces(discretization, plan, native, lambda: self._material, Material, repair)
+
+    def __call__(self, material: ElementMaterial | ViscousMaterial, u: wp.array, f: wp.array) -> None:
+        """Add the forces [N] of displacements u to f; both vec4 [worlds * N]."""
+        if self._simd is not None:
+            self._material = material
+            self._simd.scatter_forces(u, f)
+            return
+        to = f if self._slots is None else self._slots.values
+        if self._slots is not None:
+            to.zero_()
+        self._law.launch(self._kernel, self._law.element_count, [self._elements, material, u], [to])
+        if self._slots is not None:
+            self._slots.gather(f)
 
 
 @forwards("law", "shares_dilatation", "find_members", "rotation_level", "elapsed", "complete_step", "relax_fully")
@@ -60,7 +101,7 @@ class AddedStressField(ForceField):
         self.law = law
         super().__init__(discretization, law.deterministic)
         kind, own = discretization.element_kind, element_law(added.code, Material)
-        self._forces = ByElements(discretization, self.plan, Material, own.stress, added, slotted=self.deterministic)
+        self._forces = AddedForces(discretization, law, Material, own.stress, added)
         self._energies = element_energies(kind, Material, own.density, adds=True)
         self._own_law = own.differential, lambda: self.material, Material
 
@@ -80,7 +121,7 @@ class AddedStressField(ForceField):
 
     def add_own_forces(self, u: wp.array, f: wp.array) -> None:
         """Launch the kernels that add only the forces of the additional stress."""
-        self._forces(self.element_count, self.material, u, f)
+        self._forces(self.material, u, f)
 
     def scatter_forces(self, u: wp.array, f: wp.array) -> None:
         raise NotImplementedError("add_forces does all")
@@ -374,8 +415,7 @@ class Viscosity:
         complete: Callable[[wp.array], wp.array] | None = None,
     ):
         self.body, self.field, self.seconds, self._complete = body, field, seconds, complete
-        law = ViscousMaterial, viscosity_stress, VISCOUS
-        self._scatter = ByElements(body.discretization, field.plan, *law, slotted=field.deterministic)
+        self._scatter = AddedForces(body.discretization, field, ViscousMaterial, viscosity_stress, VISCOUS)
 
     def add_forces(self) -> None:
         """Launch the kernel that adds the forces of the present displacements and velocities to the body's [N]."""
@@ -387,4 +427,4 @@ class Viscosity:
         """Launch the kernel that adds the forces of displacements u and velocities v, linear in v, to f [N]."""
         material = ViscousMaterial()
         material.isotropic, material.seconds, material.velocities = self.field.isotropic, self.seconds, v
-        self._scatter(self.field.element_count, material, u, f)
+        self._scatter(material, u, f)

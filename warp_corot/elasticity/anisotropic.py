@@ -12,7 +12,7 @@ from warp_corot.discretization.discretization import Discretization, discretizat
 from warp_corot.discretization.elements import E, copied
 from warp_corot.discretization.plan import Plan
 from warp_corot.elasticity.clusters import divided
-from warp_corot.elasticity.cpu import ByElements, Lanes, as_general
+from warp_corot.elasticity.cpu import Lanes, SimdForces, as_general
 from warp_corot.elasticity.dilatation import AUTO, bind_law, check_dilatation
 from warp_corot.elasticity.model import ElementField, ForceField, Kept, Model
 from warp_corot.errors import InputError
@@ -21,7 +21,6 @@ from warp_corot.kernels.clusters.laws import ActiveMaterial, anisotropic_law, re
 from warp_corot.kernels.corotated.anisotropic import (
     REINFORCED,
     FibreMaterial,
-    OrthotropicMaterial,
     ReinforcedMaterial,
     active_density,
     fibre_cauchy,
@@ -34,7 +33,6 @@ from warp_corot.kernels.corotated.anisotropic import (
     turn_elements,
 )
 from warp_corot.kernels.corotated.well_conditioned import quaternions_of
-from warp_corot.kernels.elements.constitutive import IsotropicMaterial
 from warp_corot.kernels.elements.dilatation import LOG_VOLUME
 from warp_corot.kernels.elements.forces import element_energies, repair_forces
 from warp_corot.kernels.elements.simd8 import FIBRES
@@ -64,7 +62,7 @@ class FibreField(ElementField):
     def __init__(self, discretization: Discretization, **functions: Any):
         super().__init__(discretization, **functions)
         self.passive = discretization.anisotropic_material()
-        self._fibres = Kept(fibre_material)
+        self._fibres = Kept(FibreMaterial, "passive", "is_active", "activation")
 
     @property
     def fibres(self) -> FibreMaterial:
@@ -126,13 +124,6 @@ class AnisotropicField(FibreField):
         return self.fibres
 
 
-def fibre_material(passive: OrthotropicMaterial, is_active: int, activation: wp.array) -> FibreMaterial:
-    """An orthotropic material with an active stress."""
-    material = FibreMaterial()
-    material.passive, material.is_active, material.activation = passive, is_active, activation
-    return material
-
-
 class AnisotropicSimd8Field(AnisotropicField):
     """On the CPU, eight elements at a time."""
 
@@ -173,6 +164,10 @@ def _first(elements: E, count: int) -> E:
 # --- on CUDA: subtrees, clusters, and elements one by one ------------------------------------------------------------
 
 
+#: The fields of ``ActiveMaterial``.
+ACTIVE = ("passive", "axes", "is_active", "activation")
+
+
 class AnisotropicCudaField(AnisotropicField):
     """Complete subtrees in batches; other elements one by one or, if the mesh never changes, in clusters. Forces may be
     summed in any order.
@@ -184,6 +179,7 @@ class AnisotropicCudaField(AnisotropicField):
     def __init__(self, discretization: Discretization):
         super().__init__(discretization, quick_rotation, deterministic=False)
         self._transverse = isinstance(discretization.material, TransverselyIsotropic)
+        self._active = Kept(ActiveMaterial, *ACTIVE)
         self._quaternions = wp.empty(len(self.passive.axes), dtype=wp.quat, device=self.device)
         self.derive()
         self.follow()
@@ -204,41 +200,26 @@ class AnisotropicCudaField(AnisotropicField):
 
     def scatter_forces(self, u: wp.array, f: wp.array) -> None:
         fibres, flat = self.fibres, self.plan.flat
-        active = active_material(self.passive, self._quaternions, *self._activation)
-        for batch, kernel, flags in zip(self._batches, self._kernels, self._flags, strict=True):
-            inputs, outputs = [batch.subtrees, active, u], [f, as_bytes(flags), NO_LIST]
+        active = self._active(self.passive, self._quaternions, *self._activation)
+        for batch, kernel in zip(self._batches, self._kernels, strict=True):
+            inputs, outputs = [batch.subtrees, active, u], [f, batch.flagged, NO_LIST]
             wp.launch(kernel, batch.count, inputs=inputs, outputs=outputs, device=self.device, block_dim=BLOCK)
+            flags = batch.flags_by_eights
             inputs = [8, flags, batch.subtrees.first, self.elements, fibres, u]
             self.launch(repair_leaves, 8 * len(flags), inputs, [f])
         if self._clusters is not None:
             self._clusters(active, u, f)
         elif len(flat):
-            self.launch(scatter_flat, len(flat), [flat.elements, flat.leaves, fibres, u], [f])
+            self.launch(scatter_flat, len(flat), [self.elements, flat.leaves, fibres, u], [f])
 
     def follow(self) -> None:
         law = anisotropic_law(self._transverse)
         self._batches, self._clusters = divided(self.discretization, self.plan, law, ActiveMaterial, ANISOTROPIC)
         self._kernels = [self._kernel(batch.shape, batch.grouped) for batch in self._batches]
-        self._flags = [wp.zeros(-(-b.count // 8), dtype=wp.uint64, device=self.device) for b in self._batches]
 
     def _kernel(self, shape: int, grouped: bool) -> wp.Kernel:
         one_axes, one_stiffness = self.passive.axes_stride == 0, self.passive.stride == 0
         return scatter_anisotropic_subtrees(shape, grouped, self._transverse, one_axes, one_stiffness)
-
-
-def active_material(
-    passive: OrthotropicMaterial, axes: wp.array, is_active: int, activation: wp.array
-) -> ActiveMaterial:
-    """``kernels.clusters.laws.ActiveMaterial`` from its parts."""
-    material = ActiveMaterial()
-    material.passive, material.axes = passive, axes
-    material.is_active, material.activation = is_active, activation
-    return material
-
-
-def as_bytes(flags: wp.array) -> wp.array:
-    """The memory of uint64 [n] as uint8 [8 n]."""
-    return wp.array(ptr=flags.ptr, dtype=wp.uint8, shape=8 * len(flags), device=flags.device)
 
 
 # --- the law of Holzapfel, Gasser and Ogden, for tissue with families of fibres --------------------------------------
@@ -286,21 +267,24 @@ class ReinforcedField(FibreField):
             deterministic=deterministic,
         )
         _, self._clusters = divided(discretization, self.plan, reinforced_law, ReinforcedMaterial)
-        self._by_elements = ByElements(discretization, self.plan, ReinforcedMaterial, REINFORCED.stress, FIBRES)
-        self._made = Kept(_material)
+        self._made, self._shown = (
+            Kept(ReinforcedMaterial, "matrix", "fibres", "is_active", "activation") for _ in range(2)
+        )
+        if self.device.is_cpu:
+            self._simd = SimdForces(discretization, self.plan, FIBRES, lambda: self.material, ReinforcedMaterial)
 
     def plan_of(self, discretization: Discretization) -> Plan:
         return discretization.plan(subtrees=self.device.is_cpu, deterministic=self.deterministic)
 
     @property
     def _force_kernels(self) -> list[LoadedKernel]:
-        return self._by_elements.kernels if self._clusters is None else [self._clusters.kernel]
+        return super()._force_kernels if self._clusters is None else [self._clusters.kernel]
 
     def scatter_forces(self, u: wp.array, f: wp.array) -> None:
         if self._clusters is not None:
             self._clusters(self.material, u, f)
         else:
-            self._by_elements(self.element_count, self.material, u, f)
+            super().scatter_forces(u, f)
 
     @property
     def material(self) -> ReinforcedMaterial:
@@ -309,13 +293,4 @@ class ReinforcedField(FibreField):
 
     @property
     def material_shown(self) -> ReinforcedMaterial:
-        return _material(self.isotropic_shown, self.passive, *self._activation)
-
-
-def _material(
-    matrix: IsotropicMaterial, fibres: OrthotropicMaterial, is_active: int, activation: wp.array
-) -> ReinforcedMaterial:
-    material = ReinforcedMaterial()
-    material.matrix, material.fibres = matrix, fibres
-    material.is_active, material.activation = is_active, activation
-    return material
+        return self._shown(self.isotropic_shown, self.passive, *self._activation)

@@ -5,31 +5,31 @@ from __future__ import annotations
 from collections.abc import Callable
 from copy import copy
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
+import numpy as np
 import warp as wp
 
 from warp_corot.discretization.elements import Elements, copied
 from warp_corot.discretization.plan import Plan, Sharing
+from warp_corot.discretization.planner import places_on
 from warp_corot.elasticity.divided import Piece
-from warp_corot.elasticity.model import Kept, isotropic_material, rotated_material
+from warp_corot.elasticity.model import ROTATED, Kept, isotropic_material
 from warp_corot.inputs.cpu_threads import Team, launch, part_of
 from warp_corot.inputs.loading import LoadedKernel, load
-from warp_corot.kernels.corotated.anisotropic import FibreMaterial
-from warp_corot.kernels.elements.constitutive import IsotropicMaterial
+from warp_corot.kernels.elements.constitutive import IsotropicMaterial, RotatedMaterial
 from warp_corot.kernels.elements.cpu import (
     GROUPS,
     GroupedMaterial,
     order_elements,
     rest_matrices,
+    scatter_elements,
     scatter_grouped_elements,
-    scatter_law_elements,
-    scatter_listed_elements,
 )
 from warp_corot.kernels.elements.dilatation import Dilatation
-from warp_corot.kernels.elements.elements import GeneralElements
-from warp_corot.kernels.elements.forces import repair_forces, scatter_forces
-from warp_corot.kernels.elements.simd8 import LANES, IsotropicLaw, NativeLaw
+from warp_corot.kernels.elements.elements import ForestElements, GeneralElements
+from warp_corot.kernels.elements.forces import repair_forces
+from warp_corot.kernels.elements.simd8 import LANES, IsotropicLaw, NativeLaw, elastic
 from warp_corot.kernels.subtrees.cpu import (
     DilatingMaterial,
     ToleranceMaterial,
@@ -38,50 +38,45 @@ from warp_corot.kernels.subtrees.cpu import (
     scatter_subtrees_shared,
     scatter_subtrees_tolerance,
 )
-from warp_corot.kernels.subtrees.degenerate import repair_own, repair_shared
-from warp_corot.mesh import TetForest
+from warp_corot.kernels.subtrees.degenerate import repair_flagged, repair_own, repair_shared, robust_own_stress
 
 if TYPE_CHECKING:
     from warp_corot.discretization.discretization import Discretization
-    from warp_corot.elasticity.model import ForceField
 
 
 class Lanes:
     """Launches that add the forces of elements: first eight at a time, then those left out one by one.
 
     Args:
-        elements: The elements, of either kind.
-        general: The same elements as general ones.
+        elements: The mesh's elements, of either kind.
+        general: The chosen elements as general ones.
         scatter: Kernel that computes the general ones eight at a time and lists those that it leaves out.
         repair: Kernel that computes the listed ones among ``elements``; None if none are left out or listed.
     """
 
     def __init__(self, elements: Elements, general: Elements, *, scatter: wp.Kernel, repair: wp.Kernel | None = None):
-        self.count = len(elements.nodes)
-        self.elements = elements
-        self._general = general
-        self._scatter = scatter
-        self._repair = repair
-        #: Which of the material's values are those of the elements; None: all.
-        self._bounds: tuple[int, int] | None = None
+        self.count, self.nodes = len(general.nodes), general.nodes
+        self._elements, self._general = elements, general
+        self.kernels: list[LoadedKernel] = [scatter] if repair is None else [scatter, repair]
         #: How many, then which.
         self._degenerate = wp.zeros(self.count + 1 if repair else 0, dtype=wp.int32, device="cpu")
 
-    def scatter_forces(self, material: IsotropicMaterial | FibreMaterial, u: wp.array, f: wp.array) -> None:
+    def scatter_forces(self, material: Any, u: wp.array, f: wp.array) -> None:
         """Add the forces of displacements u to f, both vec4 [N]; ``material`` is the struct of all elements that
         kernels read."""
-        if self._bounds is not None:
-            material = part_of(material, *self._bounds)
+        scatter, *repairs = cast("list[wp.Kernel]", self.kernels)
         inputs = [self._general, self.count, material, u]
-        launch(self._scatter, -(-self.count // LANES), inputs, [f, self._degenerate], device="cpu")
-        if self._repair is not None:
-            launch(self._repair, 1, [self.elements, material, u], [self._degenerate, f], device="cpu")
+        launch(scatter, -(-self.count // LANES), inputs, [f, self._degenerate], device="cpu")
+        for repair in repairs:
+            launch(repair, 1, [self._elements, material, u], [self._degenerate, f], device="cpu")
 
     def part(self, begin: int, end: int) -> Lanes:
         """The launches of some of the elements."""
-        elements, general = (part_of(each, begin, end) for each in (self.elements, self._general))
-        part = Lanes(elements, general, scatter=self._scatter, repair=self._repair)
-        part._bounds = begin, end
+        part, general = copy(self), part_of(self._general, begin, end)
+        if not general.numbers:
+            general.numbers = wp.array(np.arange(begin, end), dtype=wp.int32, device="cpu")
+        part.count, part.nodes, part._general = end - begin, general.nodes, general
+        part._degenerate = wp.zeros_like(self._degenerate)
         return part
 
 
@@ -124,7 +119,7 @@ class Dilating:
     ):
         self.of, self.count = of, 0
         self._lam, self._plan, self._order = lam, plan, order_elements(kind)
-        self._of_subtrees = Kept(_material)
+        self._of_subtrees = Kept(DilatingMaterial, "isotropic", "lam", "tolerance")
         load(["elements.cpu"], wp.get_device("cpu"), [self._order])
         self._members, self._live, most = members, live, len(members)
         general = self._general = GeneralElements()
@@ -143,8 +138,7 @@ class Dilating:
             isotropic: The material, without lambda.
             tolerance: For the corotated law, the largest angle at which the root's rotation is used [rad]; None: never.
         """
-        made: DilatingMaterial = self._of_subtrees(isotropic, self._lam(), tolerance)
-        return made
+        return self._of_subtrees(isotropic, self._lam(), tolerance or 0.0)
 
     def parts(self, team: Team, worlds: int) -> list[Dilating]:
         """The same, each with some of the groups of all worlds, if the mesh does not change."""
@@ -154,7 +148,7 @@ class Dilating:
 
     def _part(self, begin: int, end: int) -> Dilating:
         part = copy(self)
-        part.count, part._of_groups, part._of_subtrees = end - begin, copied(self._of_groups), Kept(_material)
+        part.count, part._of_groups = end - begin, copied(self._of_groups)
         part._of_groups.starts = self._of_groups.starts[begin : end + 1]
         part._degenerate = wp.zeros_like(self._degenerate)
         return part
@@ -202,63 +196,82 @@ class Dilating:
             launch(repair, 1, [self._general, self._of_groups.isotropic, u], [self._degenerate, f], device="cpu")
 
 
-def _material(isotropic: IsotropicMaterial, lam: wp.array, tolerance: float | None) -> DilatingMaterial:
-    material = DilatingMaterial()
-    material.isotropic, material.lam, material.tolerance = isotropic, lam, tolerance or 0.0
-    return material
-
-
-# --- isotropic laws: complete subtrees, and other elements -----------------------------------------------------------
+# --- any law: complete subtrees, and other elements ------------------------------------------------------------------
 
 
 class SimdForces:
-    """The forces of an isotropic law on the CPU: of complete subtrees, whose leaves have own rotations or their root's,
-    and of other elements.
+    """The forces of a law on the CPU: of complete subtrees, and of other elements.
 
     With a shared dilatation the elements outside subtrees are in groups, and these launches add its forces, too.
 
     Args:
-        field: The field whose forces these are.
+        discretization: The mesh.
+        plan: The units of work.
         law: A law of ``kernels.elements.simd8``.
-        repair: The kernel for the elements that it leaves out; None: it leaves none out.
-        tolerance: The largest angle at which the root's rotation is used [rad]; None: never.
+        material: Gives the struct that it reads.
+        Material: The type of this struct.
+        repair: The law as ``kernels.elements.forces`` takes it, right for every F, for the elements that it leaves out.
+        tolerance: For the corotated law, the largest angle at which the root's rotation is used [rad]; None: never.
     """
 
     def __init__(
-        self, field: ForceField, law: IsotropicLaw, repair: wp.Kernel | None = None, tolerance: float | None = None
+        self,
+        discretization: Discretization,
+        plan: Plan,
+        law: IsotropicLaw | NativeLaw,
+        material: Callable[[], Any],
+        Material: type = IsotropicMaterial,
+        repair: wp.Function | None = None,
+        tolerance: float | None = None,
     ):
-        self._field, self._law, self._repair, self._tolerance = field, law, repair, tolerance
-        self.plan: Any = field.plan
+        self._kind, self._worlds = discretization.element_kind, discretization.worlds
+        self.plan: Any = plan
+        self._name: Any = law
+        self._shares_rotations = law == "corotated"
+        self._law = law if isinstance(law, NativeLaw) else elastic(law)
+        self._Material, self._material, self._tolerance = Material, material, tolerance
+        self._repairs: tuple[wp.Kernel, ...] = ()
+        if repair is not None:
+            kinds = self._kind, GeneralElements
+            of_subtrees = repair_own if repair is robust_own_stress else repair_flagged(Material, repair)
+            self._repairs = of_subtrees, *(repair_forces(kind, Material, repair) for kind in kinds)
         self._dilating: Dilating | None = None
-        self._near, self._rotated = Kept(_near_material), Kept(rotated_material)
-        self._no_rotations, self._no_unit = (wp.empty(0, dtype=kind, device="cpu") for kind in (wp.mat33, wp.int32))
+        self._near = Kept(ToleranceMaterial, "isotropic", "tolerance")
+        self._rotated = Kept(RotatedMaterial, *ROTATED)
+        #: The rotations of the plan's units, for batches that share those from further up.
+        self.rotations, self._no_unit = (wp.empty(0, dtype=kind, device="cpu") for kind in (wp.mat33, wp.int32))
         self.follow()
 
-    def share_dilatation(self, dilating: Dilating) -> None:
-        """Add the forces of a shared dilatation, too, from now on."""
+    def share_dilatation(self, dilating: Dilating) -> bool:
+        """Add the forces of a shared dilatation, too, from now on; return whether the law is an isotropic one."""
+        if isinstance(self._name, NativeLaw):
+            return False
         self._dilating = dilating
         self.derive()
         self.follow()
+        return True
 
     def derive(self) -> None:
         """See ``ForceField``."""
         if self._dilating is not None:
-            self._dilating.derive(self._field.isotropic)
+            self._dilating.derive(self._material())
 
     def follow(self) -> None:
         """See ``ForceField``."""
-        field, flat = self._field, self.plan.flat
-        of_law = {"scatter": scatter_law_elements(self._law), "repair": self._repair}
-        self._lanes: Lanes | None = None
-        self._flat_material = field.isotropic
-        if self._dilating is not None:
+        plan = self.plan
+        self._flat, self._lanes, elements = plan.flat, None, plan.elements
+        shares = self._shares_rotations and plan.units is not None
+        if self._dilating is not None or shares or (plan.kinds and not len(plan.flat)):
             return
-        if not isinstance(field.discretization.mesh, TetForest):
-            self._lanes = Lanes(field.elements, field.elements, **of_law)
-        elif len(flat):
-            self._flat_material = field.isotropic_of(flat)
-            general = flat.general or as_general(flat.elements, rest_matrices, [flat.elements])
-            self._lanes = Lanes(general, general, **of_law)
+        general = plan.flat.general or elements
+        if general is elements and self._kind is ForestElements:
+            general = as_general(elements, rest_matrices, [elements])
+        repair = self._repairs[1] if self._repairs else None
+        self._lanes = Lanes(elements, general, scatter=self._of_elements, repair=repair)
+
+    @property
+    def _of_elements(self) -> wp.Kernel:
+        return scatter_elements(self._law, self._Material)
 
     @property
     def kernels(self) -> list[LoadedKernel]:
@@ -267,53 +280,59 @@ class SimdForces:
         dilating = self._dilating
         if dilating is None and self._lanes is None and self.plan.counts is None:
             return found
-        found.append(scatter_law_elements(self._law) if dilating is None else dilating.kernel(self._law))
-        return found if self._repair is None else [*found, self._repair]
+        found.append(self._of_elements if dilating is None else dilating.kernel(self._name))
+        return [*found, *self._repairs[1:2]]
 
     def _kernel(self, shape: int, sharing: Sharing) -> wp.Kernel:
-        if sharing is not Sharing.OWN:
-            return scatter_subtrees_shared(shape, False)
+        if self._shares_rotations and sharing is not Sharing.OWN:
+            return scatter_subtrees_shared(shape, sharing is Sharing.ABOVE)
         shared = None if self._dilating is None else self._dilating.of
         if self._tolerance is not None:
             return scatter_subtrees_tolerance(shape, shared)
-        return scatter_law_subtrees(shape, self._law, shared)
+        if shared is not None:
+            return scatter_law_subtrees(shape, self._name, shared)
+        return scatter_subtrees(shape, self._Material, self._law)
 
     def scatter_forces(self, u: wp.array, f: wp.array) -> None:
         """Add the forces [N] of displacements u to f; both vec4 [N]."""
-        isotropic = self._field.isotropic
-        material: Any = isotropic
+        if self._flat is not self.plan.flat:
+            self.follow()
+        material = given = self._material()
         if self._dilating is not None:
-            material = self._dilating.material(isotropic, self._tolerance)
+            material = self._dilating.material(given, self._tolerance)
         elif self._tolerance is not None:
-            material = self._near(isotropic, self._tolerance)
+            material = self._near(given, self._tolerance)
         for batch in self.plan.batches:
             if not batch.count:
                 continue
-            own, first, threads = batch.sharing is Sharing.OWN, batch.subtrees.first, -(-batch.count // LANES)
-            of_batch = material if own else self._rotated(isotropic, self._no_rotations, self._no_unit)
+            own = not self._shares_rotations or batch.sharing is Sharing.OWN
+            first, threads = batch.subtrees.first, -(-batch.count // LANES)
+            unit = self._no_unit if batch.unit is None else batch.unit
+            of_batch = material if own else self._rotated(given, self.rotations, unit)
             inputs, kernel = [batch.subtrees, batch.count, of_batch, u], self._kernel(batch.shape, batch.sharing)
             launch(kernel, threads, inputs, [f, batch.flagged], device="cpu")
-            if self._repair is not None:
-                flags, inputs = batch.flags_by_eights, [self._field.elements, isotropic, u]
-                repair, where = (repair_own, [1, flags, first]) if own else (repair_shared, [flags, first, batch.roots])
+            if self._repairs and (own or batch.sharing is Sharing.ROOT):
+                flags, inputs = batch.flags_by_eights, [self.plan.elements, given, u]
+                repair, where = self._repairs[0], [1, flags, first]
+                if not own:
+                    repair, where = repair_shared, [flags, first, batch.subtrees.code, places_on("cpu").subtree]
                 launch(repair, len(flags), [*where, *inputs], [f], device="cpu")
         if self._dilating is not None:
-            self._dilating.scatter_groups(self._law, u, f, self._repair)
+            self._dilating.scatter_groups(self._name, u, f, self._repairs[2] if self._repairs else None)
         elif self._lanes is not None:
-            self._lanes.scatter_forces(self._flat_material, u, f)
+            self._lanes.scatter_forces(given, u, f)
 
     def pieces(self, team: Team) -> list[Piece]:
         """See ``ForceField``: copies, each with some of the subtrees and of the other elements."""
-        if self.plan.counts is not None:
+        if self.plan.counts is not None or (self._shares_rotations and self.plan.units is not None):
             return []
 
-        worlds = self._field.discretization.worlds
-
         def parts_of(whole: Any) -> list[Any]:
-            return [whole.part(*bounds) for bounds in team.bounds(whole.count, LANES, worlds)]
+            return [whole.part(*bounds) for bounds in team.bounds(whole.count, LANES, self._worlds)]
 
         batches = [parts_of(batch) for batch in self.plan.batches]
-        dilating, lanes = self._dilating and self._dilating.parts(team, worlds), self._lanes and parts_of(self._lanes)
+        dilating = self._dilating and self._dilating.parts(team, self._worlds)
+        lanes = self._lanes and parts_of(self._lanes)
         pieces: list[Any] = [copy(self) for _ in range(team.parts)]
         for part, piece in enumerate(pieces):
             piece.plan = replace(self.plan, batches=tuple(batch[part] for batch in batches))
@@ -326,83 +345,4 @@ class SimdForces:
         nodes = [batch.subtrees.nodes for batch in self.plan.batches]
         if self._dilating is not None:
             return [*nodes, self._dilating.nodes] if self._dilating.count else nodes
-        return nodes if self._lanes is None else [*nodes, self._lanes.elements.nodes]
-
-
-def _near_material(isotropic: IsotropicMaterial, tolerance: float) -> ToleranceMaterial:
-    material = ToleranceMaterial()
-    material.isotropic, material.tolerance = isotropic, tolerance
-    return material
-
-
-# --- all elements under any law, one by one or eight at a time -------------------------------------------------------
-
-
-class ByElements:
-    """Launches that add the forces of a law.
-
-    In C++ a thread takes eight complete subtrees of a mesh that never changes, and eight of all other elements.
-
-    Args:
-        discretization: The mesh.
-        plan: The units of work.
-        Material: The struct that the law reads.
-        stress: The law, as ``kernels.elements.forces`` takes it.
-        lanes: The same law in C++, if it is there.
-        slotted: Whether each element's forces go to slots of their own first, so that sums are reproducible.
-    """
-
-    def __init__(
-        self,
-        discretization: Discretization,
-        plan: Plan,
-        Material: type,
-        stress: wp.Function,
-        lanes: NativeLaw | None = None,
-        *,
-        slotted: bool = False,
-    ):
-        kind, self._device = discretization.element_kind, discretization.device
-        own = discretization.plan(subtrees=False, deterministic=True) if slotted else plan
-        self._elements, self._slots = own.elements, own.slots if slotted else None
-        self._lanes = lanes if self._device.is_cpu else None
-        self.kernels: list[LoadedKernel]
-        if self._lanes is None:
-            self.kernels = [scatter_forces(kind, Material, stress)]
-            return
-        self._batches = tuple(plan.batches) if plan.counts is None else ()
-        subtrees = [scatter_subtrees(batch.shape, Material, self._lanes, wp.int32) for batch in self._batches]
-        #: The elements outside subtrees, if any are in subtrees.
-        self._listed = plan.flat.leaves if self._batches else wp.empty(0, dtype=wp.int32, device=self._device)
-        self.kernels = [*subtrees, scatter_listed_elements(kind, Material, self._lanes)]
-        self.kernels += [repair_forces(kind, Material, stress)] if self._lanes.leaves_out else []
-        #: How many are left out, then which.
-        self._degenerate = wp.zeros(1, dtype=wp.int32, device=self._device)
-
-    def __call__(self, count: int, material: Any, u: wp.array, f: wp.array) -> None:
-        """Add the forces [N] of the first ``count`` elements to f; ``material`` is the struct that the law reads."""
-        if self._slots is None:
-            self._scatter(count, material, u, f)
-            return
-        self._slots.values.zero_()
-        self._scatter(count, material, u, self._slots.values)
-        self._slots.gather(f)
-
-    def _scatter(self, count: int, material: Any, u: wp.array, f: wp.array) -> None:
-        kernels: list[Any] = list(self.kernels)
-        if self._lanes is None:
-            wp.launch(kernels[0], count, [self._elements, material, u], [f], device=self._device)
-            return
-        if self._lanes.leaves_out and len(self._degenerate) <= count:
-            self._degenerate = wp.zeros(count + 1, dtype=wp.int32, device=self._device)
-        outputs = [f, self._degenerate]
-        for batch in self._batches:
-            inputs = [batch.subtrees, batch.count, material, u]
-            wp.launch(kernels.pop(0), -(-batch.count // LANES), inputs, outputs, device=self._device)
-        single = len(self._listed) if self._batches else count
-        eights = kernels.pop(0)
-        if single:
-            inputs = [self._elements, single, self._listed, material, u]
-            wp.launch(eights, -(-single // LANES), inputs, outputs, device=self._device)
-        for repair in kernels:
-            wp.launch(repair, 1, [self._elements, material, u], [self._degenerate, f], device=self._device)
+        return nodes if self._lanes is None else [*nodes, self._lanes.nodes]

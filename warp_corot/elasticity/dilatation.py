@@ -273,7 +273,7 @@ class DilatationField(ForceField):
         plan, flat, isotropic = self.plan, self.plan.flat, self.isotropic
         where, count = [self.elements, self._all, self._all], self.element_count
         if plan.kinds or len(flat):
-            where, count = [flat.elements, flat.leaves, self._all if flat.live is None else flat.live], len(flat)
+            where, count = [self.elements, flat.leaves, self._all if flat.live is None else flat.live], len(flat)
         self.launch(self._measure, count, [*where, u, self._still], [self._shared])
         for starts, members, live, groups in self._groups.of_others:
             inputs = [starts, members, live, self.elements, isotropic]

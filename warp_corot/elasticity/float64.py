@@ -34,7 +34,7 @@ def float64_law(model: Model) -> IsotropicLaw | None:
         return STVK
     if type(model) is Corotated:
         return COROTATED
-    return model.law.lanes if isinstance(model, LawModel) else None
+    return model.law if isinstance(model, LawModel) else None
 
 
 def stresses(law: IsotropicLaw, a: Array, mu: npt.ArrayLike, lam: npt.ArrayLike, da: Array | None = None) -> Stresses:

@@ -18,7 +18,6 @@ from warp_corot.elasticity.model import Kept
 from warp_corot.errors import InputError
 from warp_corot.inputs.loading import LoadedKernel
 from warp_corot.kernels.clusters.laws import SharingMaterial, measure_pairs, shared_pressure, sharing_law
-from warp_corot.kernels.elements.constitutive import IsotropicMaterial
 from warp_corot.kernels.elements.dilatation import Dilatation
 from warp_corot.mesh import TetForest
 
@@ -124,7 +123,7 @@ class ClusteredGroups:
         self._listed = wp.array(listed, dtype=wp.int32, device=self._device)
         self._sums = wp.zeros(len(groups), dtype=wp.vec4, device=self._device)
         self._kernel = measure_pairs(scatter.Pairs, of, scatter.layout)
-        made = Kept(_sharing_material)
+        made = Kept(SharingMaterial, "isotropic", "lam", "groups", "sums")
         scatter.use_law(
             sharing_law(scatter.law, of),
             SharingMaterial,
@@ -144,9 +143,3 @@ class ClusteredGroups:
         inputs = [scatter.clusters, scatter.pairs, self._listed, stride, self._lam(), u]
         size = scatter.count * threads
         wp.launch(self._kernel, size, inputs, [self._sums], device=self._device, block_dim=threads)
-
-
-def _sharing_material(isotropic: IsotropicMaterial, lam: wp.array, groups: wp.array, sums: wp.array) -> SharingMaterial:
-    material = SharingMaterial()
-    material.isotropic, material.lam, material.groups, material.sums = isotropic, lam, groups, sums
-    return material

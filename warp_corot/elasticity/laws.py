@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache, partial
+from functools import partial
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import warp as wp
@@ -15,25 +15,15 @@ from warp_corot.discretization.plan import Plan
 from warp_corot.elasticity.clusters import divided
 from warp_corot.elasticity.cpu import SimdForces
 from warp_corot.elasticity.dilatation import AUTO, bind_law, check_dilatation
-from warp_corot.elasticity.model import ForceField, Law, LawField, Model
+from warp_corot.elasticity.model import ForceField, LawField, Model
 from warp_corot.errors import InputError
 from warp_corot.inputs.checks import checked_number, shown
 from warp_corot.inputs.loading import LoadedKernel, load
 from warp_corot.kernels.clusters.laws import isotropic_law
-from warp_corot.kernels.elements.constitutive import (
-    law_functions,
-    linear_differential,
-    linear_energy,
-    linear_stress,
-    neo_hookean_differential,
-    neo_hookean_energy,
-    neo_hookean_stress,
-    stvk_differential,
-    stvk_energy,
-    stvk_stress,
-)
+from warp_corot.kernels.elements.constitutive import IsotropicMaterial
 from warp_corot.kernels.elements.dilatation import GREEN, LOG_VOLUME, SMALL, Dilatation
-from warp_corot.kernels.elements.simd8 import IsotropicLaw, bare, stretch_limits
+from warp_corot.kernels.elements.forces import scatter_chosen
+from warp_corot.kernels.elements.simd8 import IsotropicLaw, stretch_limits
 from warp_corot.kernels.subtrees import cuda as subtree_cuda
 from warp_corot.kernels.subtrees.degenerate import NO_LIST
 from warp_corot.kernels.subtrees.memory import BLOCK
@@ -52,7 +42,7 @@ class LawCudaField(LawField):
         law, deterministic: As for ``LawField``.
     """
 
-    def __init__(self, discretization: Discretization, law: Law, *, deterministic: bool = False):
+    def __init__(self, discretization: Discretization, law: IsotropicLaw, *, deterministic: bool = False):
         super().__init__(discretization, law, deterministic=deterministic)
         self._uniform = discretization.material_stride == 0
         self.follow()
@@ -66,23 +56,28 @@ class LawCudaField(LawField):
         of_subtrees: list[LoadedKernel] = [(kernel, BLOCK) for kernel in self._kernels]
         if self._clusters is not None:
             return [*of_subtrees, self._clusters.kernel]
-        return of_subtrees if self._batches and not len(self.plan.flat) else [*of_subtrees, self._forces]
+        if self._batches and not len(self.plan.flat):
+            return of_subtrees
+        return [*of_subtrees, self._of_flat if len(self.plan.flat) else self._forces]
 
     def load_kernels(self) -> None:
         kernels = [self._kernel(shape, grouped) for shape, grouped, _sharing in self.plan.kinds]
-        load((), self.device, [self._forces, *((kernel, BLOCK) for kernel in kernels)])
+        load((), self.device, [self._forces, self._of_flat, *((kernel, BLOCK) for kernel in kernels)])
 
     def follow(self) -> None:
-        self._batches, self._clusters = divided(self.discretization, self.plan, isotropic_law(self.law.stress))
+        self._batches, self._clusters = divided(self.discretization, self.plan, isotropic_law(self.functions.stress))
         self._kernels = [self._kernel(batch.shape, batch.grouped) for batch in self._batches]
-        self._flat_material = self.isotropic_of(self.plan.flat)
+
+    @property
+    def _of_flat(self) -> wp.Kernel:
+        return scatter_chosen(self.discretization.element_kind, IsotropicMaterial, self._functions[0])
 
     @property
     def in_clusters(self) -> tuple[ClusterScatter, Sequence[Batch]] | None:
         return None if self._clusters is None else (self._clusters, self._batches)
 
     def _kernel(self, shape: int, grouped: bool) -> wp.Kernel:
-        return subtree_cuda.scatter_law_subtrees(shape, grouped, self._uniform, self.law.stress)
+        return subtree_cuda.scatter_law_subtrees(shape, grouped, self._uniform, self.functions.stress)
 
     def scatter_forces(self, u: wp.array, f: wp.array) -> None:
         isotropic, flat = self.isotropic, self.plan.flat
@@ -92,7 +87,7 @@ class LawCudaField(LawField):
         if self._clusters is not None:
             self._clusters(isotropic, u, f)
         elif len(flat):
-            self.launch(self._forces, len(flat), [flat.elements, self._flat_material, u], [f])
+            self.launch(self._of_flat, len(flat), [self.elements, flat.leaves, isotropic, u], [f])
         elif not self._batches:
             super().scatter_forces(u, f)
 
@@ -102,14 +97,13 @@ class LawSimdField(LawField):
 
     Args:
         discretization: On the CPU.
-        law: A law that is in C++.
+        law: The law.
         deterministic: As for every field.
     """
 
-    def __init__(self, discretization: Discretization, law: Law, *, deterministic: bool = False):
+    def __init__(self, discretization: Discretization, law: IsotropicLaw, *, deterministic: bool = False):
         super().__init__(discretization, law, deterministic=deterministic)
-        assert law.lanes is not None
-        self._simd = SimdForces(self, law.lanes)
+        self._simd = SimdForces(discretization, self.plan, law, lambda: self.isotropic)
 
     def plan_of(self, discretization: Discretization) -> Plan:
         return discretization.plan()
@@ -118,14 +112,7 @@ class LawSimdField(LawField):
 # --- the choice of kernels -------------------------------------------------------------------------------------------
 
 
-@cache
-def law_of(terms: IsotropicLaw) -> Law:
-    """Ogden's law of some terms."""
-    stress, differential, energy = law_functions(bare(terms).code)
-    return Law(stress, differential, energy, terms)
-
-
-def law_field(law: Law, discretization: Discretization, deterministic: bool = False) -> LawField:
+def law_field(law: IsotropicLaw, discretization: Discretization, deterministic: bool = False) -> LawField:
     """The fastest force field of a law of the package on a discretization.
 
     Args:
@@ -149,7 +136,7 @@ class LawModel(Model):
         shared: The dilatation that elements of this law share.
     """
 
-    law: ClassVar[Law]
+    law: ClassVar[IsotropicLaw]
     shared: ClassVar[Dilatation]
 
     dilatation: str = AUTO
@@ -178,7 +165,7 @@ class Linear(LawModel):
     """
 
     strained_safety: ClassVar[float] = 0.9  # its stiffness never changes
-    law = Law(linear_stress, linear_differential, linear_energy, "linear", linear_stress)
+    law = "linear"
     shared = SMALL
 
     def bind(self, body: Discretized | Discretization, *, deterministic: bool = False) -> ForceField:
@@ -203,7 +190,7 @@ class StVenantKirchhoff(LawModel):
             more in any element, and the material is isotropic.
     """
 
-    law = Law(stvk_stress, stvk_differential, stvk_energy, "stvk")
+    law = "stvk"
     shared = GREEN
 
 
@@ -228,7 +215,7 @@ class NeoHookean(LawModel):
             more in any element, and the material is isotropic.
     """
 
-    law = Law(neo_hookean_stress, neo_hookean_differential, neo_hookean_energy, "neo-hookean")
+    law = "neo-hookean"
     shared = LOG_VOLUME
 
 
@@ -295,7 +282,7 @@ class Ogden(Model):
         return max(low), min(high)
 
     def bind(self, body: Discretized | Discretization, *, deterministic: bool = False) -> ForceField:
-        return bind_law(partial(law_field, law_of(self.terms)), LOG_VOLUME, self.dilatation, body, deterministic)
+        return bind_law(partial(law_field, self.terms), LOG_VOLUME, self.dilatation, body, deterministic)
 
 
 def _numbers(given: Any, name: str) -> tuple[float, ...]:

@@ -6,7 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar, Generic, NamedTuple, Protocol, TypeAlias, TypeVar, cast
+from typing import TYPE_CHECKING, ClassVar, Generic, Protocol, TypeAlias, TypeVar, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -14,7 +14,7 @@ import warp as wp
 
 from warp_corot.discretization.discretization import Discretization, Discretized, discretization_of
 from warp_corot.discretization.groups import Members
-from warp_corot.discretization.plan import Batch, FlatLeaves, Plan, chosen
+from warp_corot.discretization.plan import Batch, Plan
 from warp_corot.elasticity.divided import DividedForces, Piece
 from warp_corot.elasticity.tangents import ElementTangent, Tangent
 from warp_corot.errors import InputError
@@ -23,7 +23,7 @@ from warp_corot.inputs.loading import LoadedKernel, load
 from warp_corot.kernels.corotated.anisotropic import FibreMaterial, ReinforcedMaterial
 from warp_corot.kernels.corotated.tangent import KeptStrains
 from warp_corot.kernels.elements.added import Prestress, PronyMaterial
-from warp_corot.kernels.elements.constitutive import IsotropicMaterial, RotatedMaterial
+from warp_corot.kernels.elements.constitutive import IsotropicMaterial, RotatedMaterial, law_functions
 from warp_corot.kernels.elements.dilatation import DilatedMaterial
 from warp_corot.kernels.elements.forces import (
     element_energies,
@@ -46,35 +46,38 @@ S = TypeVar("S")
 
 
 class Kept(Generic[S]):
-    """The struct of some values, made again if one of these is another object.
+    """A Warp struct of some values, made again if one of these is another object.
 
     Args:
-        make: Makes the struct of the values.
+        Struct: Its type.
+        fields: The names of the values in it, in the order in which they are given.
     """
 
-    def __init__(self, make: Callable[..., S]):
-        self._make = make
+    def __init__(self, Struct: type[S], *fields: str):
+        self._Struct, self._fields = Struct, fields
         self._values: tuple = ()
-        self._struct: S | None = None
+        self._made: S | None = None
 
     def __call__(self, *values: object) -> S:
-        if self._struct is None or any(a is not b for a, b in zip(values, self._values, strict=True)):
-            self._values, self._struct = values, self._make(*values)
-        return self._struct
+        if self._made is None or any(a is not b for a, b in zip(values, self._values, strict=True)):
+            self._values, self._made = values, self.made(*values)
+        return self._made
+
+    def made(self, *values: object) -> S:
+        """A new one."""
+        made = self._Struct()
+        for name, value in zip(self._fields, values, strict=True):
+            setattr(made, name, value)
+        return made
 
 
-def rotated_material(isotropic: IsotropicMaterial, rotations: wp.array, unit: wp.array) -> RotatedMaterial:
-    """Lamé's parameters with given rotations."""
-    material = RotatedMaterial()
-    material.isotropic, material.rotations, material.unit = isotropic, rotations, unit
-    return material
+#: The fields of materials.
+ISOTROPIC, ROTATED = ("mu", "lam", "stride"), ("isotropic", "rotations", "unit")
 
 
 def isotropic_material(given: list) -> IsotropicMaterial:
     """``kernels.elements.constitutive.IsotropicMaterial`` of mu, lambda and their stride."""
-    material = IsotropicMaterial()
-    material.mu, material.lam, material.stride = given
-    return material
+    return Kept(IsotropicMaterial, *ISOTROPIC)(*given)
 
 
 # --- laws for derivatives --------------------------------------------------------------------------------------------
@@ -159,9 +162,7 @@ class ForceField(ABC):
         self.device = discretization.device
         #: On the CPU there is one thread, and the order is always the same.
         self.deterministic = deterministic and discretization.device.is_cuda
-        self._isotropic = Kept(lambda *values: isotropic_material(list(values)))
-        #: Leaves in no subtree, and copies of their Lamé's parameters.
-        self._flat_lame: tuple[wp.array, list[wp.array]] | None = None
+        self._isotropic = Kept(IsotropicMaterial, *ISOTROPIC)
         self._regions = Regions(discretization.team, self.device)
         self.plan = self.plan_of(discretization)
         self.elements, self.slots = self.plan.elements, self.plan.slots
@@ -253,10 +254,6 @@ class ForceField(ABC):
 
     def take_material(self) -> None:
         """Copy Lamé's parameters again, because their values have changed in the arrays."""
-        if self._flat_lame is not None:
-            leaves, own = self._flat_lame
-            for copy, values in zip(own, self._lame, strict=True):
-                copy.assign(chosen(values, leaves))
         if self._simd is not None:
             self._simd.derive()
 
@@ -272,9 +269,7 @@ class ForceField(ABC):
         """Add the forces of a dilatation that subtrees and groups share, too, from now on (CPU); return whether the
         field can.
         """
-        if self._simd is not None:
-            self._simd.share_dilatation(dilating)
-        return self._simd is not None
+        return self._simd is not None and self._simd.share_dilatation(dilating)
 
     @property
     def stiffest(self) -> SmallForces:
@@ -412,27 +407,6 @@ class ForceField(ABC):
         """Lamé's parameters for stresses: those of the material."""
         return isotropic_material(list(self.discretization.lame))
 
-    def isotropic_of(self, flat: FlatLeaves) -> IsotropicMaterial:
-        """Lamé's parameters for the forces of leaves in no subtree."""
-        kept = self.discretization.lame_of_flat(flat)
-        if kept is not None:
-            return isotropic_material([*kept, 1])
-        if self.discretization.material_stride == 0 or not len(flat):
-            return self.isotropic
-        if self._flat_lame is not None and self._flat_lame[0] is flat.leaves:
-            # One copy for all that read it: ``take_material`` updates one.
-            own = self._flat_lame[1]
-            for copy, values in zip(own, self._lame, strict=True):
-                copy.assign(chosen(values, flat.leaves))
-        else:
-            own = [chosen(values, flat.leaves) for values in self._lame]
-            self._flat_lame = flat.leaves, own
-        return isotropic_material([*own, 1])
-
-    @property
-    def _lame(self) -> tuple[wp.array, wp.array]:
-        return self.discretization.mu, self.discretization.lam
-
 
 class Model(ABC):
     """The description of an elastic model: a frozen dataclass of plain values.
@@ -536,22 +510,6 @@ class ElementField(ForceField):
         self.launch(self._von_mises, self.element_count, [self.elements, self.material_shown, u], [stress])
 
 
-class Law(NamedTuple):
-    """A constitutive law of each element's deformation gradient, functions of ``kernels.elements.constitutive``.
-
-    Attributes:
-        stress, differential, energy: The functions.
-        lanes: The same law of ``kernels.elements.simd8``, for the CPU; None if it is not in C++.
-        cauchy: The Cauchy stress; None: that of the stress.
-    """
-
-    stress: wp.Function
-    differential: wp.Function
-    energy: wp.Function
-    lanes: IsotropicLaw | None = None
-    cauchy: wp.Function | None = None
-
-
 class LawField(ElementField):
     """Force field of a constitutive law, element by element.
 
@@ -560,13 +518,13 @@ class LawField(ElementField):
         law: The law.
     """
 
-    def __init__(self, body: Discretized | Discretization, law: Law, *, deterministic: bool = False):
-        self.law = law
+    def __init__(self, body: Discretized | Discretization, law: IsotropicLaw, *, deterministic: bool = False):
+        self.functions = of = law_functions(law)
         super().__init__(
             body,
-            stress=law_stress(law.stress),
-            differential=law_differential(law.differential),
-            density=law_value(law.energy),
-            cauchy=law_cauchy(law.stress) if law.cauchy is None else law_value(law.cauchy),
+            stress=law_stress(of.stress),
+            differential=law_differential(of.differential),
+            density=law_value(of.energy),
+            cauchy=law_value(of.stress) if law == "linear" else law_cauchy(of.stress),
             deterministic=deterministic,
         )

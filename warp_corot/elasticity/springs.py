@@ -15,7 +15,7 @@ from warp_corot.elasticity.laws import StVenantKirchhoff
 from warp_corot.elasticity.model import ElementField, ForceField, Model, StressLaw, isotropic_material
 from warp_corot.elasticity.tangents import Tangent
 from warp_corot.inputs.checks import checked_choice
-from warp_corot.kernels.elements.constitutive import IsotropicMaterial, stvk_stress
+from warp_corot.kernels.elements.constitutive import IsotropicMaterial, law_functions
 from warp_corot.kernels.elements.forces import element_von_mises, law_cauchy
 from warp_corot.kernels.elements.springs import (
     add_mass_spring_diagonal,
@@ -62,7 +62,7 @@ class EdgeStVK(Model):
             stress=spring_stress,
             differential=spring_differential,
             density=spring_density,
-            cauchy=law_cauchy(stvk_stress),
+            cauchy=law_cauchy(law_functions("stvk").stress),
             deterministic=deterministic,
         )
 
@@ -134,7 +134,8 @@ class MassSpringField(ForceField):
         lame = 0.4 * (young if young.size == 1 else np.broadcast_to(young, (worlds, len(tets))))
         on_device = wp.array(lame.ravel(), dtype=wp.float32, device=self.device)
         self._hooke = isotropic_material([on_device, on_device, int(lame.size > 1)])
-        self._von_mises = element_von_mises(discretization.element_kind, IsotropicMaterial, law_cauchy(stvk_stress))
+        cauchy = law_cauchy(law_functions("stvk").stress)
+        self._von_mises = element_von_mises(discretization.element_kind, IsotropicMaterial, cauchy)
 
     @property
     def energy_count(self) -> int:

@@ -243,7 +243,7 @@ def part_of(whole: Any, begin: int, end: int) -> Any:
         return whole if begin == 0 and end == len(whole) else whole[begin:end]
     part = type(whole)()
     part.assign(whole)
-    of_elements = ("nodes", "targets", "code", "first", "rest_inverse", "volume", "shared")
+    of_elements = ("nodes", "targets", "code", "first", "rest_inverse", "volume", "numbers", "shared")
     for name in ("mu", "lam") if getattr(whole, "stride", 0) else of_elements:
         if getattr(whole, name, None):
             setattr(part, name, getattr(whole, name)[begin:end])

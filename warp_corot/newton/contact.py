@@ -239,24 +239,20 @@ class _Given(Kept[Any]):
     """
 
     def __init__(self, struct: Any, prefix: str, owner: Any):
-        super().__init__(self._made)
-        self._struct_type = struct
         names = [(field, name) for field in struct.vars for name in (prefix + field, field) if hasattr(owner, name)]
         self._names = {field: name for field, name in reversed(names)}
+        super().__init__(struct, *self._names)
 
     def of(self, owner: Any) -> Any:
-        return self(*(getattr(owner, name) for name in self._names.values()))
+        return self(*self._arrays(owner))
 
     def new(self, owner: Any) -> Any:
         """Another one."""
-        return self._made(*(getattr(owner, name) for name in self._names.values()))
+        return self.made(*self._arrays(owner))
 
-    def _made(self, *arrays: Any) -> Any:
-        made = self._struct_type()
-        for field, array in zip(self._names, arrays, strict=True):
-            if isinstance(array, wp.array):
-                setattr(made, field, array)
-        return made
+    def _arrays(self, owner: Any) -> list[wp.array | None]:
+        found = (getattr(owner, name) for name in self._names.values())
+        return [value if isinstance(value, wp.array) else None for value in found]
 
 
 class SoftPairs:

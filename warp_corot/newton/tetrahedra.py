@@ -12,9 +12,9 @@ from warp_corot.discretization.discretization import FixedMesh
 from warp_corot.elasticity import Corotated
 from warp_corot.elasticity.cpu import Lanes
 from warp_corot.elasticity.dilatation import ELEMENT
-from warp_corot.elasticity.model import Kept, isotropic_material
+from warp_corot.elasticity.model import ISOTROPIC, Kept, isotropic_material
 from warp_corot.errors import InputError
-from warp_corot.kernels.elements.constitutive import IsotropicMaterial, linear_stress
+from warp_corot.kernels.elements.constitutive import IsotropicMaterial, law_functions
 from warp_corot.kernels.elements.elements import GeneralElements
 from warp_corot.kernels.elements.forces import law_stress, repair_forces, scatter_forces
 from warp_corot.kernels.elements.general_cuda import BLOCK, PosedElements
@@ -258,7 +258,7 @@ class Tetrahedra:
     def add_linear_forces(self, u: wp.array, f: wp.array, moduli: list[wp.array] | None = None) -> None:
         """Add the elastic forces of small displacements from rest shapes [N] to f, vec4 [P], with these mu and lambda
         [Pa] or the model's."""
-        kernel = scatter_forces(GeneralElements, IsotropicMaterial, law_stress(linear_stress))
+        kernel = scatter_forces(GeneralElements, IsotropicMaterial, law_stress(law_functions("linear").stress))
         material = isotropic_material([*(moduli or [self.mu, self.lam]), 1])
         self._launch(kernel, self.model.tet_count, [self.elements, material, u], [f])
 
@@ -287,7 +287,7 @@ class Tetrahedra:
             inputs = [self._single, *self._single_materials, self._single_ids, activation, u, v]
             self._launch(scatter_posed(self.damped), self.single_count, inputs, [f], BLOCK)
         elif self.single_count:
-            self._lanes.scatter_forces(self._single_isotropic(*self._single_materials[:2]), u, f)
+            self._lanes.scatter_forces(self._single_isotropic(*self._single_materials[:2], 1), u, f)
         for group in self.groups:
             group.add_forces(u, f)
 
@@ -306,7 +306,7 @@ class Tetrahedra:
             repair = repair_forces(GeneralElements, IsotropicMaterial, posed_stress)
             self._lanes = Lanes(elements, elements, scatter=scatter_posed_lanes, repair=repair)
         self._single_ids, self._single_materials = wp.empty(0, dtype=wp.int32, device=self.device), self._materials
-        self._single_isotropic = Kept(lambda mu, lam: isotropic_material([mu, lam, 1]))
+        self._single_isotropic = Kept(IsotropicMaterial, *ISOTROPIC)
         if not everything:
             self._single_ids = wp.array(ids, dtype=wp.int32, device=self.device)
             self._single_materials = self._room_for_materials(len(ids))

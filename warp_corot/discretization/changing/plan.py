@@ -20,8 +20,6 @@ from warp_corot.kernels.elements.elements import ForestElements
 from warp_corot.kernels.plan import changing as kernels
 from warp_corot.kernels.plan.plan import Plan, Tree
 from warp_corot.kernels.remesh.pools import LEAF_PADDING, LEAVES, NODE_TOP
-from warp_corot.kernels.tables.shapes import MIRROR_BIT
-from warp_corot.mesh.lattice import MAX_LEVEL
 
 #: A launch keeps its size until it needs less than this fraction of it.
 SLACK = 0.8
@@ -222,32 +220,13 @@ class DevicePlan:
         """Fill in the data that only a changing plan has. Counts begin as if all places were used, so all become
         padding.
         """
-        plan, leaves, names = self._plan, self._made.leaves, self.forest.carriage.names
+        plan, names = self._plan, self.forest.carriage.names
         plan.first_unit = 1
         plan.stale, plan.goes = (wp.zeros(1, dtype=wp.int32, device=self.device) for _ in range(2))
         plan.marks = wp.zeros(most_leaves, dtype=wp.int8, device=self.device)
         plan.values = wp.zeros((len(names), most_leaves), dtype=wp.float32, device=self.device)
         units, found = (most_leaves - 1) * self.rotation_shared, int(self._with_subtrees)
         plan.counts.assign([found * self._most_subtrees] * plan.classes + [found * most_leaves, units, most_leaves])
-        count = most_leaves if self._with_subtrees else 0
-        if "mu" in names:
-            leaves.mu_row, leaves.lam_row = (names.index(name) for name in ("mu", "lam"))
-            leaves.mu, leaves.lam = (wp.zeros(count, dtype=wp.float32, device=self.device) for _ in range(2))
-        # The CPU computes eight elements at a time, from rest matrices.
-        if self.device.is_cpu and not self.rotation_shared and count:
-            leaves.rest_inverse = wp.empty(count, dtype=wp.mat33, device=self.device)
-            leaves.volume = wp.empty(count, dtype=wp.float32, device=self.device)
-            frames = 2 * len(self.forest.pools.frames)
-            codes = (np.arange(frames)[:, None] << MIRROR_BIT) + np.arange(3)
-            leaves.inverse_of, _ = self._rest_matrices(codes.ravel())
-            _, leaves.volume_of = self._rest_matrices(np.arange(MAX_LEVEL + 1))
-
-    def _rest_matrices(self, codes: npt.NDArray[np.integer]) -> tuple[wp.array, wp.array]:
-        """Rest matrices and volumes of elements by their codes."""
-        elements = self._made.elements(self.elements.nodes, wp.array(codes, dtype=wp.int32, device=self.device))
-        found = tuple(wp.empty(len(codes), dtype=dtype, device=self.device) for dtype in (wp.mat33, wp.float32))
-        wp.launch(rest_matrices, len(codes), [elements], list(found), device=self.device)
-        return found[0], found[1]
 
 
 def tree_of(forest: DeviceForest) -> Tree:

@@ -5,12 +5,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import warp as wp
 
 from warp_corot.discretization.discretization import Discretization
 from warp_corot.discretization.plan import Batch, Plan, Sharing, Units
+from warp_corot.discretization.planner import places_on
 from warp_corot.elasticity.clusters import ChangingClusterScatter, ClusterScatter, clustered
 from warp_corot.elasticity.corotated.launches import DegenerateLeaves, OwnLaunches
 from warp_corot.elasticity.corotated.tangents import (
@@ -22,9 +23,8 @@ from warp_corot.elasticity.corotated.tangents import (
     subtrees_of,
 )
 from warp_corot.elasticity.cpu import Dilating, SimdForces
-from warp_corot.elasticity.model import ForceField, Kept, StressLaw, rotated_material
+from warp_corot.elasticity.model import ROTATED, ForceField, Kept, StressLaw
 from warp_corot.elasticity.tangents import Tangent
-from warp_corot.inputs.cpu_threads import launch
 from warp_corot.inputs.loading import LoadedKernel, load
 from warp_corot.kernels.clusters.laws import isotropic_law
 from warp_corot.kernels.corotated.corotated import (
@@ -39,12 +39,11 @@ from warp_corot.kernels.corotated.corotated import (
 )
 from warp_corot.kernels.corotated.tangent import exact_differential
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial, RotatedMaterial
-from warp_corot.kernels.elements.forces import element_energies, element_von_mises, scatter_forces
-from warp_corot.kernels.elements.simd8 import LANES
+from warp_corot.kernels.elements.forces import element_energies, element_von_mises, scatter_chosen, scatter_forces
 from warp_corot.kernels.math.rotation import quick_rotation
-from warp_corot.kernels.subtrees import cpu as subtree_cpu
 from warp_corot.kernels.subtrees import cuda as subtree_cuda
-from warp_corot.kernels.subtrees.degenerate import NO_LIST, repair_elements, repair_own, repair_shared
+from warp_corot.kernels.subtrees.degenerate import NO_LIST, repair_own, repair_shared, robust_own_stress
+from warp_corot.kernels.subtrees.memory import BLOCK
 
 if TYPE_CHECKING:
     from warp_corot.elasticity.corotated.model import CorotatedOptions
@@ -74,7 +73,7 @@ class CorotatedField(ForceField):
         kind = discretization.element_kind
         self._shared: Rotations | None = None
         self._fused = model.level is None
-        self._rotated = Kept(rotated_material)
+        self._rotated = Kept(RotatedMaterial, *ROTATED)
         self._extract = extract_rotations(kind, model.own_rotation)
         self._own = scatter_forces(kind, IsotropicMaterial, own_stress(model.own_rotation))
         self._forces = scatter_forces(kind, RotatedMaterial, given_stress)
@@ -154,7 +153,7 @@ class CorotatedField(ForceField):
 
     def material_with(self, rotations: wp.array) -> RotatedMaterial:
         """The material with these rotations of the units."""
-        return rotated_material(self.isotropic, rotations, self._sharing().units.unit)
+        return Kept(RotatedMaterial, *ROTATED)(self.isotropic, rotations, self._sharing().units.unit)
 
     @property
     def stress_law(self) -> StressLaw | None:
@@ -237,9 +236,9 @@ class SubtreeField(CorotatedField):
     def __init__(self, discretization: Discretization, model: CorotatedOptions, deterministic: bool):
         super().__init__(discretization, model, deterministic)
         self._uniform = discretization.material_stride == 0
-        fixed = self.plan.counts is None and self.plan.units is None  # a mesh that changes may come to have units
-        if self.device.is_cpu and (model.level is None or fixed):
-            self._simd = SimdForces(self, "corotated", repair_elements, model.tolerance)
+        if self.device.is_cpu:
+            law = {"repair": robust_own_stress, "tolerance": model.tolerance}
+            self._simd = SimdForces(discretization, self.plan, "corotated", lambda: self.isotropic, **law)
         #: Adds the forces of all leaves, also of those that come later.
         self._clusters: ChangingClusterScatter | None = None
         if self._listed and self.rotation_level is None:
@@ -257,16 +256,25 @@ class SubtreeField(CorotatedField):
         if self._own_launches is not None:
             return [*self._own_launches.kernels, DegenerateLeaves.kernel]
         if self._simd is not None:
-            return self._simd.kernels
-        of_subtrees: list[LoadedKernel] = [(self._kernel(*kind), self._block) for kind in self.plan.kinds]
-        of_leaves = [self._own if self.plan.flat.unit is None else self._forces] if len(self.plan.flat) else []
-        return [*of_subtrees, *of_leaves]
+            given = [self._extract, self._of_flat] if self.plan.units is not None else []
+            return [*self._simd.kernels, *given]
+        of_subtrees: list[LoadedKernel] = [(self._kernel(*kind), BLOCK) for kind in self.plan.kinds]
+        return [*of_subtrees, *([self._of_flat] if len(self.plan.flat) else [])]
+
+    @property
+    def _of_flat(self) -> wp.Kernel:
+        """The kernel of leaves outside subtrees."""
+        if self.rotation_level is None:
+            law: tuple[type, wp.Function] = IsotropicMaterial, own_stress(self.model.own_rotation)
+        else:
+            law = RotatedMaterial, given_stress
+        return scatter_chosen(self.discretization.element_kind, *law)
 
     def load_kernels(self) -> None:
         one_launch = self._listed and self.rotation_level is None
         kinds = () if one_launch or self._simd is not None else self.plan.kinds
-        found: list[LoadedKernel] = [(self._kernel(*kind), self._block) for kind in kinds]
-        found += [self._forces, self._own, self._extract, repair_own]
+        found: list[LoadedKernel] = [(self._kernel(*kind), BLOCK) for kind in kinds]
+        found += [self._of_flat, self._extract, repair_own]
         found += [] if self._simd is None else self._simd.kernels
         found += [DegenerateLeaves.kernel] if self._listed else []
         load((), self.device, [*found, *([OwnLaunches.later_kernel(self._uniform)] if one_launch else [])])
@@ -285,10 +293,6 @@ class SubtreeField(CorotatedField):
     @property
     def in_clusters(self) -> tuple[ClusterScatter, Sequence[Batch]] | None:
         return None if self._own_launches is None else self._own_launches.in_clusters
-
-    @property
-    def _block(self) -> int:
-        return subtree_cuda.BLOCK if self.device.is_cuda else 256
 
     def follow(self) -> None:
         super().follow()
@@ -309,9 +313,11 @@ class SubtreeField(CorotatedField):
                 self._degenerate = DegenerateLeaves(self._own_launches.places, [], self.device)
                 return
             self._degenerate = DegenerateLeaves.of(plan, self.device)
+        if self._simd is not None:
+            self._simd.rotations = self._rotations
+            return
         self._kernels = [self._kernel(batch.shape, batch.grouped, batch.sharing) for batch in plan.batches]
-        self._batch_materials = [Kept(rotated_material) for _ in plan.batches]
-        self._flat_material, self._flat_rotated = self.isotropic_of(plan.flat), Kept(rotated_material)
+        self._batch_materials = [Kept(RotatedMaterial, *ROTATED) for _ in plan.batches]
 
     @property
     def _listed(self) -> bool:
@@ -324,50 +330,43 @@ class SubtreeField(CorotatedField):
             self._own_launches.scatter_forces(u, f, self._degenerate.own)
             self._degenerate.repair(self.elements, self.isotropic, u, f)
             return
+        plan, flat = self.plan, self.plan.flat
+        if plan.units is not None:
+            self.extract_rotations(u)
         if self._simd is not None:
             self._simd.scatter_forces(u, f)
-            return
-        if self.plan.units is not None:
-            self.extract_rotations(u)
-        for batch, kernel, kept in zip(self.plan.batches, self._kernels, self._batch_materials, strict=True):
-            self._launch_batch(batch, kernel, kept, u, f)
-        flat = self.plan.flat
-        if len(flat) and flat.unit is not None:
-            rotated = self._flat_rotated(self._flat_material, self._rotations, flat.unit)
-            self.launch(self._forces, len(flat), [flat.elements, rotated, u], [f])
-        elif len(flat):
-            self.launch(self._own, len(flat), [flat.elements, self._flat_material, u], [f])
+        else:
+            for batch, kernel, kept in zip(plan.batches, self._kernels, self._batch_materials, strict=True):
+                self._launch_batch(batch, kernel, kept, u, f)
+        if len(flat) and (self._simd is None or plan.units is not None):
+            material: Any = self.isotropic
+            if self.rotation_level is not None:
+                material = self._rotated(material, self._rotations, self._sharing().units.unit)
+            self.launch(self._of_flat, len(flat), [self.elements, flat.leaves, material, u], [f])
         if self._degenerate is not None:
             self._degenerate.repair(self.elements, self.isotropic, u, f)
 
     def _kernel(self, shape: int, grouped: bool, sharing: Sharing) -> wp.Kernel:
-        given = sharing is Sharing.ABOVE
         if sharing is Sharing.OWN:
-            if self.device.is_cpu:
-                return subtree_cpu.scatter_law_subtrees(shape)
             return subtree_cuda.scatter_subtrees_own(shape, grouped, self._uniform, self._listed)
-        if self.device.is_cpu:
-            return subtree_cpu.scatter_subtrees_shared(shape, given)
+        given = sharing is Sharing.ABOVE
         return subtree_cuda.scatter_subtrees_shared(shape, grouped, self._uniform, given, self._listed)
 
     def _launch_batch(
         self, batch: Batch, kernel: wp.Kernel, kept: Kept[RotatedMaterial], u: wp.array, f: wp.array
     ) -> None:
-        own = batch.sharing is Sharing.OWN
+        own, degenerate = batch.sharing is Sharing.OWN, self._degenerate
         unit = self._no_unit if batch.unit is None else batch.unit
         material = self.isotropic if own else kept(self.isotropic, self._rotations, unit)
-        if self.device.is_cuda:
-            threads, inputs = batch.count, [batch.subtrees, material, u]
-            outputs = [f, batch.flagged, NO_LIST if self._degenerate is None else self._degenerate.list_of(batch)]
-        else:
-            threads, inputs = -(-batch.count // LANES), [batch.subtrees, batch.count, material, u]
-            outputs = [f, batch.flagged]
-        launch(kernel, threads, inputs, outputs, device=self.device, block_dim=self._block)
-        if self._degenerate is not None or not batch.count:
+        outputs = [f, batch.flagged, NO_LIST if degenerate is None else degenerate.list_of(batch)]
+        inputs = [batch.subtrees, material, u]
+        wp.launch(kernel, batch.count, inputs, outputs, device=self.device, block_dim=BLOCK)
+        if degenerate is not None or not batch.count:
             return
         flags = batch.flags_by_eights
         inputs = [self.elements, self.isotropic, u]
         if own:
             self.launch(repair_own, len(flags), [1, flags, batch.subtrees.first, *inputs], [f])
         elif batch.sharing is Sharing.ROOT:
-            self.launch(repair_shared, len(flags), [flags, batch.subtrees.first, batch.roots, *inputs], [f])
+            where = [flags, batch.subtrees.first, batch.subtrees.code, places_on(self.device.alias).subtree]
+            self.launch(repair_shared, len(flags), [*where, *inputs], [f])

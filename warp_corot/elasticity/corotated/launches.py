@@ -9,6 +9,7 @@ import warp as wp
 
 from warp_corot.discretization.elements import Elements
 from warp_corot.discretization.plan import GROUPED_LEAVES, Awaited, Batch, FlatLeaves, Plan, Sharing
+from warp_corot.discretization.planner import places_on
 from warp_corot.elasticity.clusters import ChangingClusterScatter, ClusterScatter, grouped_and_others
 from warp_corot.inputs.loading import LoadedKernel
 from warp_corot.kernels.clusters.laws import isotropic_law
@@ -67,7 +68,8 @@ class DegenerateLeaves:
         if self._has_own:
             self._launch(repair_listed_own, [*inputs, self.own], f)
         for batch, listed in self._shared:
-            self._launch(repair_listed_shared, [batch.subtrees.first, batch.roots, *inputs, listed], f)
+            of_batch = [batch.subtrees.first, batch.subtrees.code, places_on(self._device.alias).subtree]
+            self._launch(repair_listed_shared, [*of_batch, *inputs, listed], f)
 
     def _launch(self, kernel: wp.Kernel, inputs: list, f: wp.array) -> None:
         wp.launch(
@@ -123,7 +125,7 @@ class OwnLaunches:
     ):
         self._device = plan.elements.nodes.device
         self._material = material
-        batches, self._flat = list(plan.batches), plan.flat
+        batches, self._flat, self._elements = list(plan.batches), plan.flat, plan.elements
         self._clusters: Callable[[IsotropicMaterial, wp.array, wp.array], None] | None = None
         if plan.counts is None:
             batches, leaves = grouped_and_others(plan, _fewest_grouped(plan))
@@ -182,7 +184,7 @@ class OwnLaunches:
             wp.launch(
                 scatter_body(material.stride == 0),
                 dim=self._blocks * BLOCK,
-                inputs=[self._ranges, self._flat.elements, self._flat.leaves, material, u],
+                inputs=[self._ranges, self._elements, self._flat.leaves, material, u],
                 outputs=[f, degenerate],
                 device=self._device,
                 block_dim=BLOCK,

@@ -26,7 +26,7 @@ from warp_corot.kernels.corotated.tangent import (
     kept_differential,
     turn_gradients,
 )
-from warp_corot.kernels.elements.constitutive import IsotropicMaterial, RotatedMaterial
+from warp_corot.kernels.elements.constitutive import RotatedMaterial
 from warp_corot.kernels.elements.cpu import rest_matrices
 from warp_corot.kernels.elements.elements import ForestElements, Subtrees
 from warp_corot.kernels.elements.simd8 import LANES
@@ -73,6 +73,7 @@ class ExactTangent(ElementTangent):
 
     def __init__(self, field: CorotatedField, rotation: wp.Function):
         super().__init__(field, kept_differential, self._kept, KeptStrains)
+        self._material_of = Kept(KeptStrains, "isotropic", "rotations", "strains")
         self._keep = keep_strains(field.discretization.element_kind, rotation)
         self._rotations, self._strains = (wp.zeros(0, dtype=wp.mat33, device=field.device) for _ in range(2))
 
@@ -88,10 +89,7 @@ class ExactTangent(ElementTangent):
         field.launch(self._keep, field.element_count, [field.elements, u], [self._rotations, self._strains])
 
     def _kept(self) -> KeptStrains:
-        material = KeptStrains()
-        material.isotropic = self.field.isotropic
-        material.rotations, material.strains = self._rotations, self._strains
-        return material
+        return self._material_of(self.field.isotropic, self._rotations, self._strains)
 
 
 class KeptTangent(Tangent):
@@ -124,7 +122,7 @@ class KeptTangent(Tangent):
         self._numbers = wp.array(ptr=self._kept.ptr, dtype=wp.float32, shape=4 * places, device=field.device)
         self._listed = wp.zeros(self._count + 1, dtype=wp.int32, device=field.device)
         self._none = wp.zeros(0, dtype=wp.int32, device=field.device)
-        self._material = Kept(_kept_gradients)
+        self._material = Kept(KeptGradients, "isotropic", "gradients")
 
     @property
     def kernels(self) -> list[wp.Kernel]:
@@ -150,12 +148,6 @@ class KeptTangent(Tangent):
     def add_diagonal(self, blocks: wp.array) -> None:
         self._diagonal.take(self.displacements)
         self._diagonal.add_diagonal(blocks)
-
-
-def _kept_gradients(isotropic: IsotropicMaterial, gradients: wp.array) -> KeptGradients:
-    material = KeptGradients()
-    material.isotropic, material.gradients = isotropic, gradients
-    return material
 
 
 # --- R K R^T over complete subtrees, for large uniform bodies on CUDA ------------------------------------------------
