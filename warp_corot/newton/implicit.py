@@ -244,13 +244,12 @@ class StepOperator:
 
     Attributes:
         inverse_mass: Positive if an entry is free, float32 [entries].
-        damped: Whether elements are viscous.
     """
 
     def __init__(self, model: newton.Model, tetrahedra: Tetrahedra, unknowns: Unknowns, rows: RowForces):
         self.device, self.worlds, self.node_count = model.device, unknowns.worlds, unknowns.count
         self._tetrahedra, self._rows, self._count = tetrahedra, rows, int(model.tet_count)
-        self.inverse_mass, self.damped = unknowns.mass, False
+        self.inverse_mass = unknowns.mass
         self._of_elements, self._blocks = (unknowns.zeros(wp.mat33) for _ in range(2))
         scales = wp.array([1.0, 0.0, 1.0], dtype=wp.float32, device=self.device)
         self._masses = [scales, unknowns.mass, unknowns.mass]
@@ -262,21 +261,17 @@ class StepOperator:
         #: Eight elements each on the CPU.
         self._lanes = -(-self._count // LANES) if self.device.is_cpu else 0
         self._made = made = kernels.Linearised()
-        made.mu, made.lam = tetrahedra.mu, tetrahedra.lam
+        made.mu, made.lam = (wp.zeros(self._count, dtype=wp.float32, device=self.device) for _ in range(2))
         made.rotation = wp.zeros(self._count, dtype=wp.mat33, device=self.device)
-        self._make_room_for_viscosity(0)
         made.kept = wp.zeros(PLACES * self._lanes, dtype=wp.vec4, device=self.device)
         self._kept = KeptGradients()
         self._kept.isotropic, self._kept.gradients = isotropic_material([made.mu, made.lam, 1]), made.kept
 
-    def take(self, q: wp.array, turned: wp.array, dt: float) -> None:
-        """Launch the linearisation where positions q are turned."""
-        tets, made = self._tetrahedra, self._made
-        self.damped = tets.damped
-        if self.damped and not len(made.viscosity):
-            self._make_room_for_viscosity(self._count)
-        inputs = [tets.elements, tets.k_damp, dt, q, turned]
-        self._launch(kernels.linearise, self._count, inputs, [made])
+    def take(self, turned: wp.array, dt: float) -> None:
+        """Launch the linearisation at turned positions, of a step of dt [s]."""
+        tets = self._tetrahedra
+        inputs = [tets.elements, tets.mu, tets.lam, tets.k_damp, dt, turned]
+        self._launch(kernels.linearise, self._count, inputs, [self._made])
 
     def take_diagonal(self) -> None:
         """Launch the blocks of elements on the diagonal."""
@@ -298,16 +293,12 @@ class StepOperator:
 
     def add_product(self, x: wp.array, y: wp.array) -> None:
         """Launch y += (K + D/dt) x."""
-        if self._lanes and not self.damped:
+        if self._lanes:
             inputs = [self._elements, self._count, self._kept, x]
             self._launch(add_kept_product(), self._lanes, inputs, [y, self._no_list])
             return
-        kernel = add_stiffness_product(GeneralElements, kernels.Linearised, kernels.linearised(self.damped))
+        kernel = add_stiffness_product(GeneralElements, kernels.Linearised, kernels.linearised)
         self._launch(kernel, self._count, [self._elements, self._made, self._none, x], [y])
-
-    def _make_room_for_viscosity(self, count: int) -> None:
-        self._made.gradient = wp.zeros(count, dtype=wp.mat33, device=self.device)
-        self._made.viscosity = wp.zeros(count, dtype=wp.float32, device=self.device)
 
     def _launch(self, kernel: wp.Kernel, dim: int, inputs: list, outputs: list) -> None:
         wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)
@@ -369,14 +360,14 @@ class ImplicitSteps(Steps):
         self._launch_unknowns(substep, of_bodies, given)
         if self._rows.begin(substep, of_bodies):
             self._replays.forget()
-        self._replays.launch((substep.dt, self.contacts.law.adhesion, self._operator.damped), self._launch_solve)
+        self._replays.launch((substep.dt, self.contacts.law.adhesion), self._launch_solve)
         self._rows.report(substep, share)
         self._launch_reactions(given, share)
 
     def _launch_unknowns(self, substep: Step, of_bodies: newton.State, given: newton.State) -> None:
         """Launch the linearisation, the right side, the inertia, the first motions, and how gravity changes these."""
         model, now, dt, system, operator = self.model, substep.state_in, substep.dt, self._system, self._operator
-        operator.take(now.particle_q, self._turned.positions, dt)
+        operator.take(self._turned.positions, dt)
         system.b.zero_()
         operator.add_product(self._turned.way, system.b)
         unknowns, trouble = self._unknowns, self.report.trouble
