@@ -84,19 +84,16 @@ def check_step(step: Step, model: newton.Model) -> None:
     Raises:
         InputError: An argument belongs to another model, or is on another device.
     """
-    found = []
+    found, control, contacts = [], step.control, step.contacts
     for name, state in (("state_in", step.state_in), ("state_out", step.state_out)):
         if getattr(state, "particle_q", model) is model:
             raise InputError(f"{name} is {_named(state)}; it must be a newton.State, the result of model.state()")
         found.append((name, state.particle_q, "particles", model.particle_count))
         found += [(name, attribute_of(state, each), f"warp_corot.{each}", model.tet_count) for each in STATE]
-    control, contacts = step.control, step.contacts
     if control is not None:
         found.append(("control", control.tet_activations, "tet_activations", model.tet_count))
     for name, array, what, count in found:
-        if array is None and what != "particles":
-            continue
-        if array is None or len(array) != count:
+        if (0 if array is None else len(array)) != count and (array is not None or what == "particles"):
             raise InputError(f"{name} has {0 if array is None else len(array)} {what}; the model has {count}")
         if getattr(array, "device", model.device) != model.device:
             raise InputError(f"{name} is on {array.device}; the model is on {model.device}")
@@ -158,21 +155,22 @@ class Recordings:
     """
 
     def __init__(self, device: wp.Device):
-        self._device = device
-        self._ways: list[tuple[wp.array, wp.array]] = []
-        self._recording = self._told = False
+        self._device, self._told = device, False
+        self._begin: wp.array | None = None
+        #: Where recordings begin, and where they end.
+        self._ways: dict[int, tuple[wp.array, wp.array]] = {}
 
     def follow(self, state_in: newton.State, state_out: newton.State) -> None:
         """Follow a step, if it is recorded; the steps of a recording come one after the other."""
-        goes_on, self._recording = self._recording, self._device.is_capturing
-        if self._recording and not self._told:
-            begin = self._ways.pop()[0] if goes_on else state_in.particle_q
-            self._ways = [way for way in self._ways if way[0] is not begin] + [(begin, state_out.particle_q)]
+        if not self._device.is_capturing:
+            self._begin = None
+            return
+        self._begin = state_in.particle_q if self._begin is None else self._begin
+        self._ways[self._begin.ptr] = self._begin, state_out.particle_q
 
     def check(self) -> None:
         """Warn, once, of a recording whose result no recording reads; waits for the device."""
-        begins = {begin.ptr for begin, _ in self._ways}
-        lost = (way for way in self._ways if way[1].ptr not in begins)
+        lost = (way for way in self._ways.values() if way[1].ptr not in self._ways)
         if self._told or self._device.is_capturing or all(np.array_equal(a.numpy(), b.numpy()) for a, b in lost):
             return
         self._told = True
