@@ -20,8 +20,7 @@ from warp_corot.kernels.newton import explicit, rows
 from warp_corot.kernels.newton.particles import NO_ROW, UNKNOWN_BEFORE, Bodies, Particles
 from warp_corot.mesh.topology import boundary_faces, linked, node_pairs
 
-from .checks import Step
-from .library import newton
+from .library import Step, newton
 
 #: ``newton.BodyFlags.KINEMATIC``, for bodies with prescribed motion.
 KINEMATIC = int(newton.BodyFlags.KINEMATIC)

@@ -27,9 +27,8 @@ from warp_corot.solvers.implicit.contact_solve import ContactSolve
 from warp_corot.solvers.implicit.preconditioners import BlockDiagonal
 from warp_corot.solvers.recorded import Replays
 
-from .checks import Step
 from .contact import Contacts
-from .library import newton
+from .library import Step, newton
 from .others import Others
 from .steps import Steps
 from .tetrahedra import Tetrahedra
