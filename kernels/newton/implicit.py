@@ -205,22 +205,6 @@ def begin_bodies(
     store_node(d, k + 1, angular)
 
 
-@wp.kernel(enable_backward=False)
-def add_first(
-    # In
-    first: wp.array[wp.int32],
-    solves: wp.array[wp.int32],
-    # In and out
-    linear: wp.array[wp.int32],
-    # Out
-    rounds: wp.array[wp.int32],
-):
-    """Add the first solve to the iterations of each world and to the number of solves [1]."""
-    world = wp.tid()
-    linear[world] = linear[world] + first[world]
-    rounds[world] = solves[0] + 1
-
-
 # --- how free pieces turn in a step; see ``kernels.implicit.increments`` ----------------------------------------------
 #
 # A piece is all particles that tetrahedra connect. It is turned about its centre of mass, as it will turn in the step.

@@ -17,12 +17,12 @@ from warp_corot.kernels.elements.forces import add_stiffness_product
 from warp_corot.kernels.elements.simd8 import LANES
 from warp_corot.kernels.implicit import conjugate_gradients, increments
 from warp_corot.kernels.implicit.steps import count_solves
-from warp_corot.kernels.implicit.tangent import add_vectors, find_rest, finish_blocks, finish_rows
+from warp_corot.kernels.implicit.tangent import add_vectors, finish_blocks, finish_rows
 from warp_corot.kernels.newton import implicit as kernels
 from warp_corot.kernels.newton.particles import Particles
 from warp_corot.mesh.topology import connected
 from warp_corot.solvers.implicit.block_system import BlockSystem
-from warp_corot.solvers.implicit.conjugate_gradients import LineSearch, WorldSums
+from warp_corot.solvers.implicit.conjugate_gradients import WorldSums
 from warp_corot.solvers.implicit.contact_solve import ContactSolve
 from warp_corot.solvers.implicit.preconditioners import BlockDiagonal
 from warp_corot.solvers.recorded import Replays
@@ -145,7 +145,7 @@ class RowForces:
         unknowns: The entries of vectors.
 
     Attributes:
-        solves: Number of linear solves of the last step after the first one, int32 [1].
+        solves: Number of linear solves of the last step, int32 [1].
     """
 
     def __init__(self, contacts: Contacts, unknowns: Unknowns):
@@ -343,9 +343,9 @@ class ImplicitSteps(Steps):
         self._system.solver.tolerance.fill_(TOLERANCE)
         self._solve = ContactSolve(self._system, [])
         self._motions = [unknowns.particle, self._system.x]
-        self._change, self._product, self._rest, self._r = (unknowns.zeros() for _ in range(4))
-        self._first, self._rounds = (wp.zeros(unknowns.worlds, dtype=wp.int32, device=self.device) for _ in range(2))
-        self._search = LineSearch(unknowns.worlds, unknowns.count, self._rows, self.device)
+        self._fall = unknowns.zeros()
+        #: Number of linear solves, which is that of all worlds.
+        self._rounds = wp.zeros(unknowns.worlds, dtype=wp.int32, device=self.device)
         # Viscous forces are those of the velocities after the step, which the solve finds.
         still = wp.zeros(model.particle_count, dtype=wp.vec3, device=self.device)
         self._turned_state: Any = SimpleNamespace(particle_q=self._turned.positions, particle_qd=still)
@@ -370,7 +370,7 @@ class ImplicitSteps(Steps):
         system.b.zero_()
         operator.add_product(self._turned.way, system.b)
         unknowns, trouble = self._unknowns, self.report.trouble
-        outputs = [system.b, unknowns.mass, system.x, self._change]
+        outputs = [system.b, unknowns.mass, system.x, self._fall]
         inputs = [dt, self.damping, self.contacts.particles, self._f, now.particle_qd, trouble, unknowns.particle]
         self._launch(kernels.begin_particles, model.particle_count, inputs, outputs)
         if model.body_count:
@@ -379,29 +379,21 @@ class ImplicitSteps(Steps):
             self._launch(kernels.begin_bodies, model.body_count, inputs, [*outputs, unknowns.roots])
 
     def _launch_solve(self) -> None:
-        """Launch the solve for the motions: with the contacts that act, and then until these are the right ones."""
-        operator, system, rows, x = self._operator, self._system, self._rows, self._system.x
-        operator.take_diagonal()
-        rows.update(x, is_solved=True)
-        system.update()
-        operator.apply(x, self._product)
-        self._launch(find_rest, len(x), [system.b, self._product], [self._rest])
-        wp.copy(self._r, self._rest)
-        rows.update(x)
-        rows.add_forces(self._r)
-        system.solve(self._r, self._change, guessed=True, like=system.b)
-        wp.copy(self._first, system.solver.iterations)
+        """Launch the solve for the motions, with contact until the right ones act."""
+        system, rows, solve = self._system, self._rows, self._solve
+        self._operator.take_diagonal()
+        linear, status = solve.iterations, system.solver.status
         if rows.count:
-            operator.apply(self._change, self._product)
-            self._search.launch(self._rest, self._product, self._change, x)
-            self._solve.launch()
-            rows.launch_end(x)
+            rows.update(system.x, is_solved=True)
+            solve.launch(self._fall)
+            rows.launch_end(system.x)
+            wp.copy(self._rounds, rows.solves, count=1)
         else:
-            self._launch(add_vectors, len(x), [self._change], [x])
-            rows.solves.zero_()
-            self._solve.iterations.zero_()
-        linear, status = self._solve.iterations, system.solver.status
-        self._launch(kernels.add_first, len(status), [self._first, rows.solves], [linear, self._rounds])
+            system.update()
+            self._launch(add_vectors, len(system.x), [self._fall], [system.x])
+            system.solve(guessed=True)
+            linear = system.solver.iterations
+            self._rounds.fill_(1)
         self._launch(count_solves, 1, [self._rounds, linear, status, int(conjugate_gradients.CONVERGED)], [self.totals])
 
     def _steps_of_others(self, dt: float) -> int:

@@ -133,8 +133,8 @@ class SolverCorotated(SolverBase, CouplingInterface):
         self._substeps = None if substeps is None else int(substeps)
         self._given_stable_dt = stable_dt
         self.tetrahedra = Tetrahedra(model, lame, rotation_level)
-        self._contacts = Contacts(model, self_contact_margin)
         self._others = Others(model, rigid_solver, particle_contact)
+        self._contacts = Contacts(model, self_contact_margin, moves=self._others.has_bodies)
         self._recordings = Recordings(self.device)
         self._is_implicit = integrator == "implicit"
         parts = (model, self.tetrahedra, self._contacts, self._others, damping)
