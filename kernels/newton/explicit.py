@@ -112,8 +112,9 @@ def contact_force(row: Row, gap: float, v: wp.vec3, pull: wp.vec3, m: Mobility, 
     speed = wp.length(sliding)
     force = push * n
     if speed > 0.0 and row.slope > 0.0:
-        largest = largest_damping(m.particle + body_mobility(m, sliding / speed), dt)
-        drag = sliding / (1.0 / row.slope + 1.0 / largest)
+        # The larger inverse mass is at least half of the sum, so that no velocity turns round with more speed.
+        w = wp.max(m.particle, body_mobility(m, sliding / speed))
+        drag = sliding / (1.0 / row.slope + w * dt)
         force -= held_back(drag, wp.max(push, 0.0), row.friction)
     return row.measure * force
 

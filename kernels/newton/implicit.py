@@ -6,7 +6,8 @@ linearisation of the elastic forces is
     (M (1/dt^2 + damping/dt) + K + D/dt) d = M v/dt + f + rows(d),      v_after = d/dt.
 
 K is R K R^T with each element's rotation where free pieces are turned as they will turn in the step (``turning``). The
-forces f are those there plus K times the way to there. D is the viscosity midway, where a turn has none.
+forces f are those there plus K + D/dt times the way to there. D is R D R^T with the same rotations, so it leaves turns
+alone, too: viscosity adds to the elements' moduli.
 
 A vector has an entry for each particle, and two for each body, of its translation t and of its rotation r = G s, scaled
 so that all three components of s have one moment of inertia. Entries of what is held, or moves as prescribed, are not
@@ -18,7 +19,6 @@ positive semi-definite, joins the matrix of the step. A contact that is open the
 forces are found again after each solve.
 """
 
-import functools
 from typing import Any
 
 import warp as wp
@@ -33,7 +33,7 @@ from warp_corot.kernels.implicit.line_search import TRIED
 from warp_corot.kernels.math.rotation import byers_xu, identity3
 from warp_corot.kernels.stepping.sums import Sums, store_sum
 
-from .elements import difference_gradient, viscous_product
+from .elements import difference_gradient
 from .particles import (
     SOUND,
     Bodies,
@@ -54,11 +54,9 @@ wp.set_module_options({"enable_backward": False})
 class Linearised:
     """Elements where a step is linearised."""
 
-    mu: wp.array[wp.float32]  # [T] [Pa]
+    mu: wp.array[wp.float32]  # [T] with what viscosity adds [Pa]
     lam: wp.array[wp.float32]  # [T] [Pa]
     rotation: wp.array[wp.mat33]  # [T]
-    gradient: wp.array[wp.mat33]  # [T] F midway; empty where nothing is viscous
-    viscosity: wp.array[wp.float32]  # [T] over dt and |F|^2 / 3 [Pa]
     kept: wp.array[wp.vec4]  # turned gradients, see ``KeptGradients``; empty on CUDA
 
 
@@ -66,38 +64,29 @@ class Linearised:
 def linearise(
     # In
     elements: GeneralElements,
+    mu: wp.array[wp.float32],
+    lam: wp.array[wp.float32],
     k_damp: wp.array[wp.float32],
     dt: float,
-    q: wp.array[wp.vec3],
     turned: wp.array[wp.vec3],
     # Out
     made: Linearised,
 ):
     t = wp.tid()
-    f = difference_gradient(elements, t, turned)
-    r = byers_xu(f)
+    r = byers_xu(difference_gradient(elements, t, turned))
     made.rotation[t] = r
     if made.kept.shape[0] > 0:
         keep_gradients(elements, t, r, made.kept)
-    if made.gradient.shape[0] > 0:
-        f = 0.5 * (f + difference_gradient(elements, t, q))
-        made.gradient[t] = f
-        made.viscosity[t] = 3.0 * k_damp[t] / (dt * wp.max(wp.ddot(f, f), 1.0e-12))
+    viscosity = k_damp[t] / dt
+    made.mu[t] = mu[t] + 0.5 * viscosity
+    made.lam[t] = lam[t] + viscosity
 
 
-@functools.cache
-def linearised(is_viscous: bool) -> wp.Function:
+@wp.func
+def linearised(elements: Any, t: int, made: Linearised, u: wp.array[wp.vec4], dg: wp.mat33):
     """The differential for ``elements.forces``."""
-
-    @wp.func
-    def linearised(elements: Any, t: int, made: Linearised, u: wp.array[wp.vec4], dg: wp.mat33):
-        r = made.rotation[t]
-        p = r * hooke(symmetric(wp.transpose(r) * dg), made.mu[t], made.lam[t])
-        if wp.static(is_viscous):
-            p += made.viscosity[t] * viscous_product(made.gradient[t], dg)
-        return p
-
-    return linearised
+    r = made.rotation[t]
+    return r * hooke(symmetric(wp.transpose(r) * dg), made.mu[t], made.lam[t])
 
 
 @wp.kernel(enable_backward=False)
@@ -105,20 +94,14 @@ def add_element_blocks(elements: GeneralElements, made: Linearised, blocks: wp.a
     """Add the 3x3 blocks of K + D/dt on the diagonal; in closed form, at a sixth of the differentials' cost."""
     t = wp.tid()
     b = elements.rest_inverse[t]
-    volume = elements.volume[t]
     first = -(b[0] + b[1] + b[2])
     for k in range(4):
         g = first
         if k > 0:
             g = b[k - 1]
-        square = wp.dot(g, g)
         turned = made.rotation[t] * g
-        block = (made.mu[t] * square) * identity3() + (made.mu[t] + made.lam[t]) * wp.outer(turned, turned)
-        if made.gradient.shape[0] > 0:
-            f = made.gradient[t]
-            stretched = f * g
-            block += made.viscosity[t] * ((0.5 * square) * (f * wp.transpose(f)) + 1.5 * wp.outer(stretched, stretched))
-        wp.atomic_add(blocks, elements.nodes[t][k], volume * block)
+        block = (made.mu[t] * wp.dot(g, g)) * identity3() + (made.mu[t] + made.lam[t]) * wp.outer(turned, turned)
+        wp.atomic_add(blocks, elements.nodes[t][k], elements.volume[t] * block)
 
 
 @wp.kernel(enable_backward=False)
@@ -219,22 +202,6 @@ def begin_bodies(
     store_node(b, k + 1, right_turn)
     store_node(d, k, linear)
     store_node(d, k + 1, angular)
-
-
-@wp.kernel(enable_backward=False)
-def add_first(
-    # In
-    first: wp.array[wp.int32],
-    solves: wp.array[wp.int32],
-    # In and out
-    linear: wp.array[wp.int32],
-    # Out
-    rounds: wp.array[wp.int32],
-):
-    """Add the first solve to the iterations of each world and to the number of solves [1]."""
-    world = wp.tid()
-    linear[world] = linear[world] + first[world]
-    rounds[world] = solves[0] + 1
 
 
 # --- how free pieces turn in a step; see ``kernels.implicit.increments`` ----------------------------------------------

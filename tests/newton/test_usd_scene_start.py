@@ -183,11 +183,6 @@ class TestLyingInOneAnother:
         path = block(tmp_path / "in.usda", ground=False)
         assert parts(path, ground=0.05, fix="z < 0.06").ground is not None
 
-    def test_a_ground_that_cuts_a_rigid_body(self, tmp_path):
-        path = block(tmp_path / "in.usda", lambda made, _: made.box(at=(0.5, 0.0, -0.1)), ground=False)
-        with pytest.warns(UserWarning, match=r"/World/Box begins 0\.15 m deep in the ground"):
-            parts(path, ground=-0.05)
-
     @pytest.mark.parametrize("what", ["ground", "box"])
     def test_a_body_in_a_collider(self, tmp_path, what):
         """The warning names it and the depth of its deepest point; mere contact is not reported."""
@@ -272,11 +267,6 @@ class TestNotes:
         assert sim.parts.ground[0, 2] == pytest.approx(0.0, abs=1e-6)
         assert f"{SIM}: points in no tetrahedron, which stay where they are: 1" in sim.parts.notes
         np.testing.assert_array_equal(sim.show().positions[0][36], sim.parts.model.particle_q.numpy()[36])
-
-    @pytest.mark.parametrize(("size", "said"), [(0.05, True), (0.3, False)])
-    def test_bodies_that_can_slip_in_between_points(self, tmp_path, size, said):
-        path = block(tmp_path / "in.usda", lambda made, _: made.box(at=(0.03, 0.02, 0.5), size=size))
-        assert (f"/World/Box is {size:g} m wide and can slip in between the points of {SIM}" in notes(path)) == said
 
     def test_soft_bodies_that_do_not_touch_one_another(self, tmp_path):
         def change(made, _):

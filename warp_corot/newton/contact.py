@@ -20,8 +20,7 @@ from warp_corot.kernels.newton import explicit, rows
 from warp_corot.kernels.newton.particles import NO_ROW, UNKNOWN_BEFORE, Bodies, Particles
 from warp_corot.mesh.topology import boundary_faces, linked, node_pairs
 
-from .checks import Step
-from .library import newton
+from .library import Step, newton
 
 #: ``newton.BodyFlags.KINEMATIC``, for bodies with prescribed motion.
 KINEMATIC = int(newton.BodyFlags.KINEMATIC)
@@ -39,6 +38,7 @@ class Contacts:
     Args:
         model: The model.
         margin: Distance at which soft bodies begin to push one another [m]; None: they do not.
+        moves: Whether forces move bodies in a step; else they go on as they are.
 
     Attributes:
         rows: The rows of a step: those of its contacts with shapes, and then of attachments.
@@ -47,7 +47,8 @@ class Contacts:
         reactions: Wrenches of the particles on the bodies in the last substep [N, N m], spatial_vector [B].
     """
 
-    def __init__(self, model: newton.Model, margin: float | None = None):
+    def __init__(self, model: newton.Model, margin: float | None = None, *, moves: bool = True):
+        self._fixed = KINEMATIC if moves else int(newton.BodyFlags.ALL)
         self.model, self.device, bodies = model, model.device, model.body_count
         #: Contacts of soft bodies with one another, if they have any.
         self.pairs = None if margin is None else SoftPairs(model, margin)
@@ -220,7 +221,7 @@ class Contacts:
 
     def _made_bodies(self, q: wp.array | None, qd: wp.array | None) -> Bodies:
         made = self._of_bodies.new(self.model)
-        made.fixed_flag, made.places = KINEMATIC, self._places
+        made.fixed_flag, made.places = self._fixed, self._places
         if self.model.body_count:
             made.q, made.qd = q, qd
         return made

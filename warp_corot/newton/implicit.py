@@ -17,19 +17,18 @@ from warp_corot.kernels.elements.forces import add_stiffness_product
 from warp_corot.kernels.elements.simd8 import LANES
 from warp_corot.kernels.implicit import conjugate_gradients, increments
 from warp_corot.kernels.implicit.steps import count_solves
-from warp_corot.kernels.implicit.tangent import add_vectors, find_rest, finish_blocks, finish_rows
+from warp_corot.kernels.implicit.tangent import add_vectors, finish_blocks, finish_rows
 from warp_corot.kernels.newton import implicit as kernels
 from warp_corot.kernels.newton.particles import Particles
 from warp_corot.mesh.topology import connected
 from warp_corot.solvers.implicit.block_system import BlockSystem
-from warp_corot.solvers.implicit.conjugate_gradients import LineSearch, WorldSums
+from warp_corot.solvers.implicit.conjugate_gradients import WorldSums
 from warp_corot.solvers.implicit.contact_solve import ContactSolve
 from warp_corot.solvers.implicit.preconditioners import BlockDiagonal
 from warp_corot.solvers.recorded import Replays
 
-from .checks import Step
 from .contact import Contacts
-from .library import newton
+from .library import Step, newton
 from .others import Others
 from .steps import Steps
 from .tetrahedra import Tetrahedra
@@ -144,7 +143,7 @@ class RowForces:
         unknowns: The entries of vectors.
 
     Attributes:
-        solves: Number of linear solves of the last step after the first one, int32 [1].
+        solves: Number of linear solves of the last step, int32 [1].
     """
 
     def __init__(self, contacts: Contacts, unknowns: Unknowns):
@@ -242,13 +241,12 @@ class StepOperator:
 
     Attributes:
         inverse_mass: Positive if an entry is free, float32 [entries].
-        damped: Whether elements are viscous.
     """
 
     def __init__(self, model: newton.Model, tetrahedra: Tetrahedra, unknowns: Unknowns, rows: RowForces):
         self.device, self.worlds, self.node_count = model.device, unknowns.worlds, unknowns.count
         self._tetrahedra, self._rows, self._count = tetrahedra, rows, int(model.tet_count)
-        self.inverse_mass, self.damped = unknowns.mass, False
+        self.inverse_mass = unknowns.mass
         self._of_elements, self._blocks = (unknowns.zeros(wp.mat33) for _ in range(2))
         scales = wp.array([1.0, 0.0, 1.0], dtype=wp.float32, device=self.device)
         self._masses = [scales, unknowns.mass, unknowns.mass]
@@ -260,21 +258,17 @@ class StepOperator:
         #: Eight elements each on the CPU.
         self._lanes = -(-self._count // LANES) if self.device.is_cpu else 0
         self._made = made = kernels.Linearised()
-        made.mu, made.lam = tetrahedra.mu, tetrahedra.lam
+        made.mu, made.lam = (wp.zeros(self._count, dtype=wp.float32, device=self.device) for _ in range(2))
         made.rotation = wp.zeros(self._count, dtype=wp.mat33, device=self.device)
-        self._make_room_for_viscosity(0)
         made.kept = wp.zeros(PLACES * self._lanes, dtype=wp.vec4, device=self.device)
         self._kept = KeptGradients()
         self._kept.isotropic, self._kept.gradients = isotropic_material([made.mu, made.lam, 1]), made.kept
 
-    def take(self, q: wp.array, turned: wp.array, dt: float) -> None:
-        """Launch the linearisation where positions q are turned."""
-        tets, made = self._tetrahedra, self._made
-        self.damped = tets.damped
-        if self.damped and not len(made.viscosity):
-            self._make_room_for_viscosity(self._count)
-        inputs = [tets.elements, tets.k_damp, dt, q, turned]
-        self._launch(kernels.linearise, self._count, inputs, [made])
+    def take(self, turned: wp.array, dt: float) -> None:
+        """Launch the linearisation at turned positions, of a step of dt [s]."""
+        tets = self._tetrahedra
+        inputs = [tets.elements, tets.mu, tets.lam, tets.k_damp, dt, turned]
+        self._launch(kernels.linearise, self._count, inputs, [self._made])
 
     def take_diagonal(self) -> None:
         """Launch the blocks of elements on the diagonal."""
@@ -296,16 +290,12 @@ class StepOperator:
 
     def add_product(self, x: wp.array, y: wp.array) -> None:
         """Launch y += (K + D/dt) x."""
-        if self._lanes and not self.damped:
+        if self._lanes:
             inputs = [self._elements, self._count, self._kept, x]
             self._launch(add_kept_product(), self._lanes, inputs, [y, self._no_list])
             return
-        kernel = add_stiffness_product(GeneralElements, kernels.Linearised, kernels.linearised(self.damped))
+        kernel = add_stiffness_product(GeneralElements, kernels.Linearised, kernels.linearised)
         self._launch(kernel, self._count, [self._elements, self._made, self._none, x], [y])
-
-    def _make_room_for_viscosity(self, count: int) -> None:
-        self._made.gradient = wp.zeros(count, dtype=wp.mat33, device=self.device)
-        self._made.viscosity = wp.zeros(count, dtype=wp.float32, device=self.device)
 
     def _launch(self, kernel: wp.Kernel, dim: int, inputs: list, outputs: list) -> None:
         wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)
@@ -351,9 +341,9 @@ class ImplicitSteps(Steps):
         self._system.solver.tolerance.fill_(TOLERANCE)
         self._solve = ContactSolve(self._system, [])
         self._motions = [unknowns.particle, self._system.x]
-        self._change, self._product, self._rest, self._r = (unknowns.zeros() for _ in range(4))
-        self._first, self._rounds = (wp.zeros(unknowns.worlds, dtype=wp.int32, device=self.device) for _ in range(2))
-        self._search = LineSearch(unknowns.worlds, unknowns.count, self._rows, self.device)
+        self._fall = unknowns.zeros()
+        #: Number of linear solves, which is that of all worlds.
+        self._rounds = wp.zeros(unknowns.worlds, dtype=wp.int32, device=self.device)
         # Viscous forces are those of the velocities after the step, which the solve finds.
         still = wp.zeros(model.particle_count, dtype=wp.vec3, device=self.device)
         self._turned_state: Any = SimpleNamespace(particle_q=self._turned.positions, particle_qd=still)
@@ -367,18 +357,18 @@ class ImplicitSteps(Steps):
         self._launch_unknowns(substep, of_bodies, given)
         if self._rows.begin(substep, of_bodies):
             self._replays.forget()
-        self._replays.launch((substep.dt, self.contacts.law.adhesion, self._operator.damped), self._launch_solve)
+        self._replays.launch((substep.dt, self.contacts.law.adhesion), self._launch_solve)
         self._rows.report(substep, share)
         self._launch_reactions(given, share)
 
     def _launch_unknowns(self, substep: Step, of_bodies: newton.State, given: newton.State) -> None:
         """Launch the linearisation, the right side, the inertia, the first motions, and how gravity changes these."""
         model, now, dt, system, operator = self.model, substep.state_in, substep.dt, self._system, self._operator
-        operator.take(now.particle_q, self._turned.positions, dt)
+        operator.take(self._turned.positions, dt)
         system.b.zero_()
         operator.add_product(self._turned.way, system.b)
         unknowns, trouble = self._unknowns, self.report.trouble
-        outputs = [system.b, unknowns.mass, system.x, self._change]
+        outputs = [system.b, unknowns.mass, system.x, self._fall]
         inputs = [dt, self.damping, self.contacts.particles, self._f, now.particle_qd, trouble, unknowns.particle]
         self._launch(kernels.begin_particles, model.particle_count, inputs, outputs)
         if model.body_count:
@@ -387,29 +377,21 @@ class ImplicitSteps(Steps):
             self._launch(kernels.begin_bodies, model.body_count, inputs, [*outputs, unknowns.roots])
 
     def _launch_solve(self) -> None:
-        """Launch the solve for the motions: with the contacts that act, and then until these are the right ones."""
-        operator, system, rows, x = self._operator, self._system, self._rows, self._system.x
-        operator.take_diagonal()
-        rows.update(x, is_solved=True)
-        system.update()
-        operator.apply(x, self._product)
-        self._launch(find_rest, len(x), [system.b, self._product], [self._rest])
-        wp.copy(self._r, self._rest)
-        rows.update(x)
-        rows.add_forces(self._r)
-        system.solve(self._r, self._change, guessed=True, like=system.b)
-        wp.copy(self._first, system.solver.iterations)
+        """Launch the solve for the motions, with contact until the right ones act."""
+        system, rows, solve = self._system, self._rows, self._solve
+        self._operator.take_diagonal()
+        linear, status = solve.iterations, system.solver.status
         if rows.count:
-            operator.apply(self._change, self._product)
-            self._search.launch(self._rest, self._product, self._change, x)
-            self._solve.launch()
-            rows.launch_end(x)
+            rows.update(system.x, is_solved=True)
+            solve.launch(self._fall)
+            rows.launch_end(system.x)
+            wp.copy(self._rounds, rows.solves, count=1)
         else:
-            self._launch(add_vectors, len(x), [self._change], [x])
-            rows.solves.zero_()
-            self._solve.iterations.zero_()
-        linear, status = self._solve.iterations, system.solver.status
-        self._launch(kernels.add_first, len(status), [self._first, rows.solves], [linear, self._rounds])
+            system.update()
+            self._launch(add_vectors, len(system.x), [self._fall], [system.x])
+            system.solve(guessed=True)
+            linear = system.solver.iterations
+            self._rounds.fill_(1)
         self._launch(count_solves, 1, [self._rounds, linear, status, int(conjugate_gradients.CONVERGED)], [self.totals])
 
     def _steps_of_others(self, dt: float) -> int:

@@ -1,6 +1,10 @@
-"""The only module that imports Newton."""
+"""The only module that imports Newton, and the arguments of a step with Newton's types."""
 
 from __future__ import annotations
+
+from typing import NamedTuple
+
+import warp as wp
 
 from warp_corot.errors import InputError
 
@@ -24,5 +28,18 @@ __all__ = [
     "ModelView",
     "SolverBase",
     "SolverSemiImplicit",
+    "Step",
     "newton",
 ]
+
+
+class Step(NamedTuple):
+    """The arguments of ``SolverCorotated.step`` or of one of its substeps, and the array for the mean wrenches of
+    contacts in the step."""
+
+    state_in: newton.State
+    state_out: newton.State
+    control: newton.Control | None
+    contacts: newton.Contacts | None
+    dt: float
+    reported: wp.array | None = None

@@ -20,8 +20,7 @@ import warp as wp
 from warp_corot.errors import InputError
 from warp_corot.kernels.newton.particles import scatter_blocks
 
-from .checks import Step
-from .library import ModelView, SolverBase, SolverSemiImplicit, newton
+from .library import ModelView, SolverBase, SolverSemiImplicit, Step, newton
 
 #: Effective number of contacts of a particle with others in a heap, for their total stiffness. A pair that moves
 #: against each other counts twice, and opposite contacts count with the square of the cosine of their directions.

@@ -10,24 +10,24 @@ import numpy as np
 import warp as wp
 
 from warp_corot.errors import InputError
-from warp_corot.inputs.checks import refuse_tape
+from warp_corot.inputs.checks import checked_choice, checked_count, checked_number, refuse_tape, shown
 from warp_corot.kernels.newton.rows import sum_by_shape
 from warp_corot.simulation.energy import Solves
 
-from .checks import Recordings, Step, check_options, check_step, checked_dt, checked_mask
 from .contact import Contacts
 from .implicit import ImplicitSteps
-from .library import CouplingInterface, SolverBase, newton
+from .library import CouplingInterface, ModelView, SolverBase, Step, newton
 from .others import Others
-from .scene import register_custom_attributes
-from .steps import Steps
+from .scene import STATE, attribute_of, register_custom_attributes
+from .steps import Recordings, Steps
 from .substeps import SAFETY, Following, check_substep, stable_steps
-from .tetrahedra import Tetrahedra
+from .tetrahedra import LAME, Tetrahedra
 
 #: Factor by which a recorded substep may exceed the safe one; below the smallest margin of the safe substep.
 EXCESS = 1.1
 #: A step with more substeps would take minutes.
 MOST_SUBSTEPS = 1_000_000
+INTEGRATORS = ("explicit", "implicit")
 
 
 class SolverCorotated(SolverBase, CouplingInterface):
@@ -119,7 +119,7 @@ class SolverCorotated(SolverBase, CouplingInterface):
         stable_dt: float | None = None,
         cuts: None = None,
     ):
-        check_options(
+        _check_options(
             model,
             lame=lame,
             damping=damping,
@@ -133,8 +133,8 @@ class SolverCorotated(SolverBase, CouplingInterface):
         self._substeps = None if substeps is None else int(substeps)
         self._given_stable_dt = stable_dt
         self.tetrahedra = Tetrahedra(model, lame, rotation_level)
-        self._contacts = Contacts(model, self_contact_margin)
         self._others = Others(model, rigid_solver, particle_contact)
+        self._contacts = Contacts(model, self_contact_margin, moves=self._others.has_bodies)
         self._recordings = Recordings(self.device)
         self._is_implicit = integrator == "implicit"
         parts = (model, self.tetrahedra, self._contacts, self._others, damping)
@@ -244,7 +244,7 @@ class SolverCorotated(SolverBase, CouplingInterface):
         self.validate_observables(observables, contacts)
         reported = None if observables is None else observables.contact_f
         step, following = Step(state_in, state_out, control, contacts, dt, reported), self._following
-        check_step(step, self.model)
+        _check_step(step, self.model)
         self._steps.report.check_earlier(following)
         count = self._count_for(dt)
         self._steps.launch(step, count, following)
@@ -292,7 +292,7 @@ class SolverCorotated(SolverBase, CouplingInterface):
             flags: ``newton.StateFlags`` of what is reset: PARTICLE_Q, PARTICLE_QD, and, if this solver steps the
                 bodies, BODY_Q and BODY_QD; None: all.
         """
-        mask = self._all_worlds if world_mask is None else checked_mask(world_mask, self.model)
+        mask = self._all_worlds if world_mask is None else _checked_mask(world_mask, self.model)
         self._steps.reset(state, mask, int(newton.StateFlags.ALL if flags is None else flags))
         for solver in self._others.solvers:
             solver.reset(state, world_mask, flags)
@@ -356,7 +356,9 @@ class SolverCorotated(SolverBase, CouplingInterface):
             self._following.find_rest(self.contact_dt)
 
     def _count_for(self, dt: float) -> int:
-        dt = checked_dt(dt)
+        if isinstance(dt, bool) or not 0.0 < checked_number(dt, "dt", "s") < math.inf:
+            raise InputError(f"dt is {dt!r}; it must be a positive number of seconds")
+        dt = float(dt)
         if self._following is not None:
             count = self._following.count_for(dt)
             if count > MOST_SUBSTEPS:
@@ -368,3 +370,94 @@ class SolverCorotated(SolverBase, CouplingInterface):
             return count
         check_substep(dt, count, self.stable_dt, self.contact_dt)
         return count
+
+
+# --- checks of arguments ---------------------------------------------------------------------------------------------
+
+
+def _check_options(
+    model: Any,
+    *,
+    lame: Any,
+    damping: Any,
+    integrator: Any,
+    substeps: Any,
+    stable_dt: Any,
+    self_contact_margin: Any,
+    cuts: Any,
+) -> None:
+    """Check the options of ``SolverCorotated``.
+
+    Raises:
+        InputError: One is out of its range.
+    """
+    if not isinstance(model, newton.Model | ModelView):
+        raise InputError(f"model is {_named(model)}; it must be a newton.Model, the result of builder.finalize()")
+    if cuts is not None:
+        raise InputError(
+            "cuts is given, but a cut makes new particles, and the number of a Newton model's particles is fixed; "
+            "warp_corot.Simulation(..., cuts=[blade]) cuts"
+        )
+    checked_choice(lame, "lame", LAME)
+    checked_choice(integrator, "integrator", INTEGRATORS)
+    if not 0.0 <= checked_number(damping, "damping", "1/s") < math.inf:
+        raise InputError(f"damping is {damping!r}; it must be zero or a positive rate in 1/s")
+    if substeps is not None:
+        checked_count(substeps, "substeps", 1)
+    if stable_dt is not None and not checked_number(stable_dt, "stable_dt", "s") > 0.0:
+        raise InputError(f"stable_dt is {stable_dt!r}; it must be a positive number of seconds or None")
+    if self_contact_margin is None:
+        return
+    if not 0.0 < checked_number(self_contact_margin, "self_contact_margin", "m") < math.inf:
+        raise InputError(f"self_contact_margin is {self_contact_margin!r}; it must be a positive distance in m or None")
+    if integrator == "implicit":
+        raise InputError(
+            "self_contact_margin is given, and integrator is 'implicit', in whose steps soft bodies do not touch one "
+            "another: use integrator='explicit', or no self_contact_margin"
+        )
+
+
+def _check_step(step: Step, model: newton.Model) -> None:
+    """Check the arguments of ``SolverCorotated.step`` except dt.
+
+    Args:
+        step: The arguments.
+        model: The model.
+
+    Raises:
+        InputError: An argument belongs to another model, or is on another device.
+    """
+    found, control, contacts = [], step.control, step.contacts
+    for name, state in (("state_in", step.state_in), ("state_out", step.state_out)):
+        if getattr(state, "particle_q", model) is model:
+            raise InputError(f"{name} is {_named(state)}; it must be a newton.State, the result of model.state()")
+        found.append((name, state.particle_q, "particles", model.particle_count))
+        found += [(name, attribute_of(state, each), f"warp_corot.{each}", model.tet_count) for each in STATE]
+    if control is not None:
+        found.append(("control", control.tet_activations, "tet_activations", model.tet_count))
+    for name, array, what, count in found:
+        if (0 if array is None else len(array)) != count and (array is not None or what == "particles"):
+            raise InputError(f"{name} has {0 if array is None else len(array)} {what}; the model has {count}")
+        if getattr(array, "device", model.device) != model.device:
+            raise InputError(f"{name} is on {array.device}; the model is on {model.device}")
+    if contacts is not None and contacts.soft_contact_max and contacts.soft_contact_count.device != model.device:
+        raise InputError(f"contacts are on {contacts.soft_contact_count.device}; the model is on {model.device}")
+
+
+def _checked_mask(world_mask: Any, model: newton.Model) -> wp.array:
+    """A mask of worlds, bool [world_count + 1].
+
+    Raises:
+        InputError: It is not such an array, or is on another device.
+    """
+    shape = (model.world_count + 1,)
+    fits = isinstance(world_mask, wp.array) and world_mask.dtype == wp.bool and world_mask.shape == shape
+    if not fits or world_mask.device != model.device:
+        raise InputError(
+            f"world_mask is {shown(world_mask)}; it must be bool [{shape[0]}], a Warp array on {model.device}"
+        )
+    return world_mask
+
+
+def _named(value: Any) -> str:
+    return "None" if value is None else f"a {type(value).__name__}"

@@ -9,14 +9,13 @@ from types import SimpleNamespace
 import numpy as np
 import warp as wp
 
-from warp_corot.errors import InputError, UnstableError
+from warp_corot.errors import InputError, UnstableError, depth_of_user
 from warp_corot.kernels.newton import particles as kernels
 from warp_corot.solvers.pace import Mapped
 from warp_corot.solvers.recorded import FlushedSubnormals, Replays
 
-from .checks import Step
 from .contact import Contacts
-from .library import newton
+from .library import Step, newton
 from .others import Others, with_changes
 from .substeps import RETRIES, Following
 from .tetrahedra import Tetrahedra
@@ -330,3 +329,42 @@ class Report:
             following.share *= 0.5
             hint += "; from now on steps have twice the substeps, recorded ones when they are recorded again"
         return f"the step's result is {wrong}{where}; that state was not changed{hint}"
+
+
+class Recordings:
+    """The states between which recordings lead.
+
+    A graph keeps the addresses of the states. If a frame swaps two states an odd number of times, its replay reads the
+    same old state again and again, unless the result is copied back.
+
+    Args:
+        device: The model's device.
+    """
+
+    def __init__(self, device: wp.Device):
+        self._device, self._told = device, False
+        self._begin: wp.array | None = None
+        #: Where recordings begin, and where they end.
+        self._ways: dict[int, tuple[wp.array, wp.array]] = {}
+
+    def follow(self, state_in: newton.State, state_out: newton.State) -> None:
+        """Follow a step, if it is recorded; the steps of a recording come one after the other."""
+        if not self._device.is_capturing:
+            self._begin = None
+            return
+        self._begin = state_in.particle_q if self._begin is None else self._begin
+        self._ways[self._begin.ptr] = self._begin, state_out.particle_q
+
+    def check(self) -> None:
+        """Warn, once, of a recording whose result no recording reads; waits for the device."""
+        lost = (way for way in self._ways.values() if way[1].ptr not in self._ways)
+        if self._told or self._device.is_capturing or all(np.array_equal(a.numpy(), b.numpy()) for a, b in lost):
+            return
+        self._told = True
+        warnings.warn(
+            "recorded steps end in another state than that from which they begin, and nothing copies it back: each "
+            "replay begins where the first one did; record an even number of swaps, or end the recording with "
+            "state_in.assign(state_out)",
+            UserWarning,
+            stacklevel=depth_of_user(),
+        )

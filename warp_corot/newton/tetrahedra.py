@@ -29,9 +29,11 @@ from warp_corot.kernels.newton.elements import (
 from warp_corot.kernels.newton.particles import add_nodes, gather_nodes
 from warp_corot.mesh import TetForest
 
-from .checks import LAME, why_none
 from .library import newton
 from .scene import STATE, attribute_of, mesh_fill, outward_tets
+
+#: Meanings of k_mu and k_lambda: mu = a k_mu, lambda = k_lambda + b k_mu, as (a, b).
+LAME = {"documented": (1.0, 0.0), "semi-implicit": (0.75, -0.625)}
 
 
 class ForestGroup:
@@ -159,6 +161,19 @@ def _squeezed(values: npt.NDArray[np.float64]) -> npt.NDArray[np.float64] | floa
     return one if np.allclose(values, one, rtol=2e-7, atol=0.0) else values
 
 
+def _why_none(model: newton.Model) -> str:
+    """In one line, why a model has no tetrahedra, and what to do."""
+    bodies = 0 if model.volume_particle_start is None else len(model.volume_particle_start)
+    if not bodies:
+        return "the model has no tetrahedra; add some with add_soft_mesh, add_soft_grid or add_forest"
+    labels = [str(label) for label in model.volume_label]
+    named = f"{bodies} soft bod{'y' if bodies == 1 else 'ies'} ({', '.join(labels[:3])}{', ...' * (bodies > 3)})"
+    return (
+        f"the model has no tetrahedra, though {named}: Newton's builder leaves out those that are wrongly wound; "
+        "build with warp_corot.newton.add_mesh(builder, warp_corot.TetMesh(points, tets), ...), which repairs them"
+    )
+
+
 class Tetrahedra:
     """Forces, rotations and stresses of all tetrahedra of a model.
 
@@ -180,7 +195,7 @@ class Tetrahedra:
 
     def __init__(self, model: newton.Model, lame: str, rotation_level: int | None):
         if not model.tet_count:
-            raise InputError(why_none(model))
+            raise InputError(_why_none(model))
         self.model, self.lame = model, lame
         self.device = model.device
         self.tets = model.tet_indices.numpy().reshape(-1, 4)

@@ -504,10 +504,6 @@ def check_ground(made: StageModel, builder: newton.ModelBuilder, height: float, 
             f"m, {(height - low) * metres:.3g} m below it, and would be thrown up; it must be at most "
             f'{_round(low * metres)}, or "auto" (--ground)'
         )
-    for path, bounds in _falling(made, builder):
-        if bounds[0, axis] < height - 0.01 * (bounds[1, axis] - bounds[0, axis]):
-            deep = (height - bounds[0, axis]) * metres
-            warnings.warn(f"{path} begins {deep:.3g} m deep in the ground (--ground)", UserWarning, stacklevel=4)
 
 
 def notes_of(made: StageModel, builder: newton.ModelBuilder, options: StageOptions) -> Iterator[str]:
@@ -534,14 +530,6 @@ def notes_of(made: StageModel, builder: newton.ModelBuilder, options: StageOptio
             yield f"--{name} is not used: the stage gives it for all soft bodies"
     if len(made.soft) > 1 and not options.soft_contact:
         yield "soft bodies touch colliders and rigid bodies, not one another"
-    body = max(made.soft, key=lambda one: one.edge)
-    for path, bounds in _falling(made, builder):
-        width = float(np.sort(bounds[1] - bounds[0])[1]) * scene.units.metres
-        if width < body.edge and body.edge > 2.0 * options.radius:
-            yield (
-                f"{path} is {width:.3g} m wide and can slip in between the points of {body.prim.path}, {body.edge:.3g} "
-                "m apart, because contact is only at points; a finer mesh or points with a radius help (--radius)"
-            )
 
 
 def staying(builder: newton.ModelBuilder) -> set[int]:
@@ -557,15 +545,6 @@ def staying(builder: newton.ModelBuilder) -> set[int]:
         before = len(found)
         found |= {child for parent, child in joints if parent in found}
     return found
-
-
-def _falling(made: StageModel, builder: newton.ModelBuilder) -> Iterator[tuple[str, npt.NDArray[np.float64]]]:
-    """Rigid bodies that can fall, with their bounds."""
-    held = staying(builder)
-    for path, index in made.rigid.items():
-        bounds = None if index in held else made.scene.bounds(path)
-        if bounds is not None:
-            yield path, bounds
 
 
 def _names(paths: list[str]) -> str:

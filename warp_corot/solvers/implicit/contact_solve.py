@@ -70,11 +70,15 @@ class ContactSolve:
         for newton in self._newtons:
             newton.move_held(to_end=False)
 
-    def launch(self) -> None:
-        """Launch the linear solves, until contact no longer changes."""
+    def launch(self, guess: wp.array | None = None) -> None:
+        """Launch the linear solves, until contact no longer changes; with a guess of the motions' change, vec4, the
+        first one begins there and is solved to the tolerance."""
         for count in (self._rounds, self.iterations, *self._of_pairs[1:]):
             count.zero_()
         self.system.apply_bodies(self.system.x, self._image)
+        if guess is not None:
+            wp.copy(self._change, guess)
+            self._round(guessed=True)
         if not self.system.couples:
             self._until_settled()
         else:
@@ -93,7 +97,7 @@ class ContactSolve:
         if self.system.couples:
             self._contact.launch_searched_again(self.system.x, self._rounds, ROUNDS, self._again)
 
-    def _round(self) -> None:
+    def _round(self, *, guessed: bool = False) -> None:
         system, contact, d = self.system, self._contact, self.system.x
         contact.locate(d)
         contact.update(d)
@@ -101,7 +105,7 @@ class ContactSolve:
         contact.add_forces(self._r)
         wp.launch(kernels.find_scale, len(d), [system.b, self._rest, self._r, self._like], device=self.device)
         system.take_contact()
-        system.solve(self._r, self._change, like=self._like, share=SHARE)
+        system.solve(self._r, self._change, guessed=guessed, like=self._like, share=0.0 if guessed else SHARE)
         system.apply_bodies(self._change, self._q)
         contact.find_reached(d, self._change)
         self._search.launch(self._rest, self._q, self._change, d, self._image)
