@@ -67,7 +67,6 @@ def add_product(product: wp.array[wp.vec4], r: wp.array[wp.vec4]):
 @wp.kernel(enable_backward=False)
 def take_increments(
     # In
-    adds: int,
     count: int,
     inverse_mass: wp.array[wp.float32],
     base: wp.array[wp.vec4],
@@ -79,13 +78,11 @@ def take_increments(
     u: wp.array[wp.vec4],
     sizes: wp.array2d[wp.float32],
 ):
-    """Take a share of d as the increment of free nodes, or add it with ``adds``, and find the largest change and
-    displacement of each world; all are one if ``sizes`` has one row."""
+    """Take a share of d as the increment of free nodes, and find the largest change and displacement of each world; all
+    are one if ``sizes`` has one row."""
     i = wp.tid()
     if inverse_mass[i] > 0.0:
         after = share[0] * load_node(d, i)
-        if adds != 0:
-            after += load_node(increment, i)
         place = load_node(base, i) + after
         if sizes.shape[0] > 0:
             world = wp.min(i / count, sizes.shape[0] - 1)

@@ -28,6 +28,8 @@ RUNNING, CONVERGED, STUCK, LIMIT, BROKEN = (wp.constant(k) for k in range(5))
 
 #: Least decrease, as a fraction of the one that the slope predicts.
 ARMIJO = wp.constant(wp.float64(1e-4))
+#: The only step of a world may go beyond the end of the descent by this fraction of its length.
+BEYOND = wp.constant(wp.float64(0.3))
 #: Relative rounding error of a strain energy in float32.
 ROUNDING = wp.constant(wp.float64(1e-6))
 #: The smallest fraction of a step that is tried.
@@ -282,3 +284,48 @@ def judge_step(
             promised = scalars[world, SLOPE_NOW]
             if correction <= tolerance or promised <= tolerance * tolerance * scalars[world, ENERGY_NOW]:
                 stop(status, running, world, CONVERGED)
+
+
+@wp.kernel(enable_backward=False)
+def judge_only(
+    # In
+    parts: wp.array3d[wp.float64],
+    lanes: int,
+    inertia: wp.array[wp.float32],
+    # In and out
+    scalars: wp.array2d[wp.float64],
+    status: wp.array[wp.int32],
+    running: wp.array[wp.int32],
+):
+    """Stop worlds whose whole step does not go far beyond the end of the descent, and let the others begin again.
+
+    r . step after the step is that of elastic forces, which the first column of parts has, and of a polynomial; it is
+    zero where the derivative is right. What is not finite is left to the run, which goes back.
+    """
+    world, lane = wp.tid()
+    after = add_up(parts, world, lane, lanes, SLOPE) + add_up(parts, world, lane, lanes, OUTER)
+    after -= wp.float64(inertia[0]) * add_up(parts, world, lane, lanes, INERTIA)
+    if lane == 0 and status[world] == RUNNING:
+        if not is_number(after) or after >= -BEYOND * scalars[world, SLOPE_NOW]:
+            stop(status, running, world, CONVERGED)
+        else:
+            scalars[world, SHARE] = wp.float64(0.0)
+
+
+@wp.kernel(enable_backward=False)
+def end_only(
+    # In
+    scalars: wp.array2d[wp.float64],
+    iterations: wp.array[wp.int32],
+    inner_status: wp.array[wp.int32],
+    # In and out
+    status: wp.array[wp.int32],
+):
+    """A world with one iteration ended as its linear solve did, and a residual that falls no more is small enough."""
+    world = wp.tid()
+    if iterations[world] == 1 and (status[world] == CONVERGED or status[world] == STUCK):
+        status[world] = wp.where(inner_status[world] == CONVERGED, CONVERGED, LIMIT)
+        if inner_status[world] == BROKEN or not is_number(scalars[world, SLOPE_NOW]):
+            status[world] = BROKEN
+    elif status[world] == STUCK:
+        status[world] = CONVERGED

@@ -6,6 +6,8 @@ wp.set_module_options({"enable_backward": False})
 
 #: Pixels without a triangle.
 NOTHING = wp.constant(wp.int64(-1))
+#: The cosine between normals of triangles that face alike.
+ALIKE = wp.constant(0.98)
 
 
 @wp.func
@@ -55,76 +57,118 @@ def find_nearest(
                 wp.atomic_max(nearest, row, column, (near << wp.int64(32)) | wp.int64(f))
 
 
-@wp.kernel(enable_backward=False)
-def shade(
-    # In
-    nearest: wp.array2d[wp.int64],
-    corners: wp.array2d[wp.vec3],
-    points: wp.array2d[wp.vec3],
-    normals: wp.array2d[wp.vec3],
-    values: wp.array2d[float],
-    table: wp.array[wp.vec3],
-    rigid: wp.vec3,
-    viewer: wp.vec3,
-    up: wp.vec3,
-    key: wp.vec3,
-    fill: wp.vec3,
-    edge: float,
-    behind: wp.array2d[wp.uint8],
-    palette: wp.array2d[wp.uint8],
-    encoded: wp.array[wp.uint8],
-    # Out
-    image: wp.array3d[wp.uint8],
-):
-    """Shade the nearest triangles under a key light, a fill light and the sky.
+@wp.struct
+class Lit:
+    """What the colours of triangles come from.
 
-    Args:
+    Attributes:
+        corners: As for `find_nearest`, [F, 3].
         points, normals: At the corners of triangles [F, 3].
         values: Places in the table of colours from 0 to 1 [F, 3]; NaN for what is ``rigid``.
         table: Linear colours.
         viewer: Where the viewer is [m].
         up, key, fill: Unit vectors up and to the lights.
         edge: Half of the width of the lines along edges [pixels]; 0 for none.
-        behind: The row of the palette plus one for what is seen beside triangles; 0 for pixels that stay.
-        palette: sRGB [n, 3].
         encoded: sRGB of evenly spaced linear values.
-        image: sRGB, [height, width, 3].
     """
-    row, column = wp.tid()
-    if nearest[row, column] == NOTHING:
-        if behind[row, column] > wp.uint8(0):
-            for k in range(3):
-                image[row, column, k] = palette[int(behind[row, column]) - 1, k]
-        return
-    f = int(nearest[row, column] & wp.int64(0xFFFFFFFF))
-    a, b, c = corners[f, 0], corners[f, 1], corners[f, 2]
-    x, y = float(column) + 0.5, float(row) + 0.5
+
+    corners: wp.array2d[wp.vec3]
+    points: wp.array2d[wp.vec3]
+    normals: wp.array2d[wp.vec3]
+    values: wp.array2d[float]
+    table: wp.array[wp.vec3]
+    rigid: wp.vec3
+    viewer: wp.vec3
+    up: wp.vec3
+    key: wp.vec3
+    fill: wp.vec3
+    edge: float
+    encoded: wp.array[wp.uint8]
+
+
+@wp.func
+def color_at(lit: Lit, f: int, x: float, y: float):
+    """The colour of a triangle at a place of the picture, sRGB from 0 to 255."""
+    a, b, c = lit.corners[f, 0], lit.corners[f, 1], lit.corners[f, 2]
     flat = shares_at(a, b, c, x, y)
     shares = wp.cw_mul(flat, wp.vec3(a[2], b[2], c[2]))
     shares /= shares[0] + shares[1] + shares[2]
     normal, point, value = wp.vec3(0.0), wp.vec3(0.0), float(0.0)
     for k in range(3):
-        normal += shares[k] * normals[f, k]
-        point += shares[k] * points[f, k]
-        value += shares[k] * values[f, k]
+        normal += shares[k] * lit.normals[f, k]
+        point += shares[k] * lit.points[f, k]
+        value += shares[k] * lit.values[f, k]
     normal = wp.normalize(normal)
-    base = rigid
+    base = lit.rigid
     if not wp.isnan(value):
-        base = table[int(wp.clamp(value, 0.0, 1.0) * float(table.shape[0] - 1) + 0.5)]
-    lambert = wp.max((wp.dot(normal, key) + 0.2) / 1.2, 0.0)
-    sky = 0.5 + 0.5 * wp.dot(normal, up)
+        base = lit.table[int(wp.clamp(value, 0.0, 1.0) * float(lit.table.shape[0] - 1) + 0.5)]
+    lambert = wp.max((wp.dot(normal, lit.key) + 0.2) / 1.2, 0.0)
+    sky = 0.5 + 0.5 * wp.dot(normal, lit.up)
     # Ambient light is slightly rose: grey light would turn the colour map's yellows olive.
-    ambient = 0.13 + 0.24 * sky + 0.30 * wp.max(wp.dot(normal, fill), 0.0)
+    ambient = 0.13 + 0.24 * sky + 0.30 * wp.max(wp.dot(normal, lit.fill), 0.0)
     light = wp.vec3(1.06 * ambient, 0.96 * ambient, ambient) + wp.vec3(0.74 * lambert)
-    mirrored = wp.max(wp.dot(normal, wp.normalize(key + wp.normalize(viewer - point))), 0.0)
+    mirrored = wp.max(wp.dot(normal, wp.normalize(lit.key + wp.normalize(lit.viewer - point))), 0.0)
     eighth = mirrored * mirrored * mirrored * mirrored * mirrored * mirrored * mirrored * mirrored
     gloss = 0.06 * eighth * eighth * eighth
-    if edge > 0.0:
+    if lit.edge > 0.0:
         # The double area of a triangle with a corner here, over its base, is the distance to that edge.
         sides = wp.vec3(wp.length(c - b), wp.length(a - c), wp.length(b - a))
         away = wp.cw_div(wp.abs(twice_area(a, b, c[0], c[1])) * flat, sides)
-        if wp.min(away) < edge:
+        if wp.min(away) < lit.edge:
             light *= 0.6
+    color = wp.vec3()
     for k in range(3):
         linear = wp.clamp(base[k] * light[k] + gloss, 0.0, 1.0)
-        image[row, column, k] = encoded[int(linear * float(encoded.shape[0] - 1) + 0.5)]
+        color[k] = float(lit.encoded[int(linear * float(lit.encoded.shape[0] - 1) + 0.5)])
+    return color
+
+
+@wp.func
+def triangle_at(nearest: wp.array2d[wp.int64], row: int, column: int):
+    """The nearest triangle at a pixel, -1 if there is none."""
+    return wp.where(nearest[row, column] == NOTHING, -1, int(nearest[row, column] & wp.int64(0xFFFFFFFF)))
+
+
+@wp.kernel(enable_backward=False)
+def shade(
+    # In
+    nearest: wp.array2d[wp.int64],
+    lit: Lit,
+    behind: wp.array2d[wp.uint8],
+    palette: wp.array2d[wp.uint8],
+    # Out
+    image: wp.array3d[wp.uint8],
+):
+    """Shade the nearest triangles under a key light, a fill light and the sky; a thread has four pixels, whose colour
+    is found once where they are of triangles that face alike.
+
+    Args:
+        behind: The row of the palette plus one for what is seen beside triangles; 0 for pixels that stay.
+        palette: sRGB [n, 3].
+        image: sRGB, [height, width, 3].
+    """
+    top, left = wp.tid()
+    top, left = 2 * top, 2 * left
+    bottom, right = wp.min(top + 2, nearest.shape[0]), wp.min(left + 2, nearest.shape[1])
+    first = triangle_at(nearest, top, left)
+    alike = first >= 0 and lit.edge == 0.0
+    for row in range(top, bottom):
+        for column in range(left, right):
+            f = triangle_at(nearest, row, column)
+            if alike and f != first:
+                alike = f >= 0 and wp.dot(lit.normals[f, 0], lit.normals[first, 0]) > ALIKE
+    color = wp.vec3()
+    if alike:
+        color = color_at(lit, first, float(left) + 1.0, float(top) + 1.0)
+    for row in range(top, bottom):
+        for column in range(left, right):
+            f = triangle_at(nearest, row, column)
+            if f < 0:
+                if behind[row, column] > wp.uint8(0):
+                    for k in range(3):
+                        image[row, column, k] = palette[int(behind[row, column]) - 1, k]
+            else:
+                if not alike:
+                    color = color_at(lit, f, float(column) + 0.5, float(row) + 0.5)
+                for k in range(3):
+                    image[row, column, k] = wp.uint8(color[k])

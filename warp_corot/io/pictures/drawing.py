@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -203,7 +203,6 @@ def render(
         InputError: Arrays that do not fit each other, or positions that are not finite.
     """
     from PIL import Image, ImageDraw
-    from scipy.ndimage import binary_dilation
 
     x, tri = checked_surface(positions, faces, "positions")
     values, line = _values(scalars, len(x), tri), max(round(window.fineness), 1)
@@ -220,22 +219,25 @@ def render(
     behind = np.zeros(image.shape[:2], np.uint8) if ghost is None else ghost.copy()
     front = camera.sees_outside(x, tri)
     nearest, corners = _nearest(window, camera, x[tri[front]])
-    behind[binary_dilation(nearest.numpy() >= 0, iterations=line)] = 3
+    behind[_widened(nearest.numpy() >= 0, line)] = 3
     lowest, highest = value_range or value_limits(scalars)
     shares = np.zeros(tri.shape) if values is None else (values - lowest) / max(highest - lowest, 1e-30)
     table = srgb_to_linear(np.array([color]) if values is None else stress_colors())
     right, _, towards = camera.axes
     key = -0.45 * right + 0.80 * camera.world_up + 0.60 * towards
     fill = 0.9 * right + 0.1 * camera.world_up + 0.5 * towards
-    given = [x[tri[front]], _corner_normals(x, tri, front)]
-    inputs = [nearest, corners, *(wp.array(each, dtype=wp.vec3, device="cpu") for each in given)]
-    inputs += [wp.array(shares[front], dtype=float, device="cpu"), wp.array(table, dtype=wp.vec3, device="cpu")]
-    inputs += [wp.vec3(*srgb_to_linear(STEEL)), wp.vec3(*(camera.center + camera.distance * towards))]
-    inputs += [wp.vec3(*camera.world_up), wp.normalize(wp.vec3(*key)), wp.normalize(wp.vec3(*fill)), 0.5 * line * edges]
+    lit = kernels.Lit()
+    lit.corners, lit.rigid, lit.edge = corners, wp.vec3(*srgb_to_linear(STEEL)), 0.5 * line * edges
+    given = [x[tri[front]], _corner_normals(x, tri, front), table]
+    lit.points, lit.normals, lit.table = (wp.array(each, dtype=wp.vec3, device="cpu") for each in given)
+    lit.values = wp.array(shares[front], dtype=float, device="cpu")
+    lit.viewer, lit.up = wp.vec3(*(camera.center + camera.distance * towards)), wp.vec3(*camera.world_up)
+    lit.key, lit.fill = wp.normalize(wp.vec3(*key)), wp.normalize(wp.vec3(*fill))
     tables = (behind, np.array([_GHOST_LINE, _GHOST, _INK], np.uint8), _ENCODED)
-    inputs += [wp.array(each, dtype=wp.uint8, device="cpu", copy=False) for each in tables]
+    drawn_behind, palette, lit.encoded = (wp.array(each, dtype=wp.uint8, device="cpu", copy=False) for each in tables)
     shown = wp.array(image, dtype=wp.uint8, device="cpu", copy=False)
-    wp.launch(kernels.shade, nearest.shape, inputs, [shown], device="cpu")
+    blocks = [-(-each // 2) for each in nearest.shape]
+    wp.launch(kernels.shade, blocks, [nearest, lit, drawn_behind, palette], [shown], device="cpu")
     if held is None or not np.any(held):
         return image
     drawn = Image.fromarray(image)
@@ -251,13 +253,22 @@ def silhouette(window: Window, camera: Camera, rest: ArrayLike, faces: ArrayLike
     Raises:
         InputError: See `render`.
     """
-    from scipy.ndimage import binary_dilation
-
     x, tri = checked_surface(rest, faces, "rest")
     inside = _nearest(window, camera, x[tri[camera.sees_outside(x, tri)]])[0].numpy() >= 0
-    drawn = binary_dilation(inside, iterations=max(round(window.fineness), 1)).astype(np.uint8)
+    drawn = _widened(inside, max(round(window.fineness), 1)).astype(np.uint8)
     drawn[inside] = 2
     return drawn
+
+
+def _widened(mask: NDArray[np.bool_], pixels: int) -> NDArray[np.bool_]:
+    """A mask that reaches farther by a number of pixels along and across."""
+    for _ in range(pixels):
+        wide = mask.copy()
+        for to, of in ((np.s_[1:], np.s_[:-1]), (np.s_[:-1], np.s_[1:])):
+            wide[to] |= mask[of]
+            wide[:, to] |= mask[:, of]
+        mask = wide
+    return mask
 
 
 def value_limits(scalars: ArrayLike | None) -> tuple[float, float]:
@@ -334,12 +345,12 @@ def _shadow(window: Window, camera: Camera, triangles: Array, height: float) -> 
     from scipy.ndimage import gaussian_filter
 
     dropped = dropped_shadow(triangles.reshape(-1, 3), camera, height).reshape(triangles.shape)
-    dark = Image.fromarray((_nearest(window, camera, dropped)[0].numpy() >= 0).astype(np.float32))
     across = float(np.ptp(window.pixels(camera.project(dropped)[0])[..., 0]))
     coarser = max(int(across / 120.0), 1)  # blurs are wide
-    small = np.asarray(dark.reduce(coarser))
+    size = (-(-window.size[0] // coarser), -(-window.size[1] // coarser))
+    small = (_nearest(replace(window, size=size), camera, dropped)[0].numpy() >= 0).astype(np.float32)
     blurred = sum(0.5 * gaussian_filter(small, width * across / coarser) for width in (0.017, 0.07))
-    return np.asarray(Image.fromarray(blurred).resize(dark.size, Image.Resampling.BILINEAR))
+    return np.asarray(Image.fromarray(blurred).resize(window.size, Image.Resampling.BILINEAR))
 
 
 def _dots(

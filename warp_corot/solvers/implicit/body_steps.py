@@ -30,6 +30,9 @@ if TYPE_CHECKING:
 #: The search for soft surfaces leaves room for this many times what a body that is let go falls in a step.
 FALLS = 0.25
 
+#: The tolerance of steps of one iteration that have to be repeated, since the whole step raises the energy.
+REPEATED = 1e-3
+
 
 class SharedSteps:
     """What the steps of all bodies share: the system, its constraints, and the launches of forces.
@@ -152,7 +155,7 @@ class BodySteps:
             system,
             self.system.gravity,
             number=number,
-            tolerance=options.tolerance or options.linear_tolerance,
+            tolerance=options.tolerance or REPEATED,
             most=options.iterations,
             others=self._add_others,
         )

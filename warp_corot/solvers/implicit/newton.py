@@ -128,7 +128,7 @@ class Newton:
 
     def launch_iteration(self) -> None:
         """Launch one iteration of all worlds that run."""
-        u, sums = self.body.state.displacements, self._sums
+        sums = self._sums
         self._launch_energies()
         self.launch_residual()
         outputs = [self._scalars, self.iterations, self.status, self.running, self.solver.tolerance]
@@ -136,18 +136,54 @@ class Newton:
         self.linearise()
         self.system.update()
         self.system.solve()
-        inputs = [self.body.conditions.mass, self.residual, self._outer, self.step, u]
-        sums.launch(kernels.measure_step, inputs, int(kernels.SLOPE), int(kernels.OUTER), int(kernels.INERTIA))
-        sums.take_in(int(kernels.STEP), int(kernels.REACH), most=True)
-        self._searching.zero_()
-        self._accepted.zero_()
-        inputs = [self.solver.iterations]
-        outputs = [self._scalars, self.iterations, self.solved, self.status, self.running, self._searching]
-        sums.launch_scalars(kernels.begin_search, inputs, outputs)
+        self._begin_search()
         wp.capture_while(self._searching, self._launch_trial)
         self._try_step(commits=True)
         inputs = [wp.float64(self.tolerance), self.solver.status]
         sums.launch_scalars(kernels.judge_step, inputs, [self._scalars, self.status, self.running])
+
+    def launch_only(self, linear_tolerance: wp.array) -> None:
+        """Launch a single iteration in all worlds, from a guess of ``step``. Worlds whose step goes too far, since the
+        matrix lacks a part of the derivative, begin again and iterate.
+
+        Args:
+            linear_tolerance: Tolerance of the only linear solve in each world, float64 [worlds].
+        """
+        self.launch_begin()
+        self.launch_residual()
+        self.linearise()
+        self.system.update()
+        wp.copy(self.solver.tolerance, linear_tolerance)
+        self.system.solve(guessed=True)
+        self._begin_search()
+        self._try_step(commits=False)
+        self.field.add_forces(self.body.state.displacements, self.forces)
+        self.ranks.owned(self.body).clear_ghosts(self.forces)
+        self._measure_step(self.forces)
+        outputs = [self._scalars, self.status, self.running]
+        self._sums.launch_scalars(kernels.judge_only, [self.inertia], outputs)
+        self.forces.zero_()
+        self._try_step(commits=True)
+        turned, self.turned = self.turned, None
+        wp.capture_while(self.running, self.launch_iteration)
+        self.turned = turned
+        inputs = [self._scalars, self.iterations, self.solver.status]
+        wp.launch(kernels.end_only, self.worlds, inputs, [self.status], device=self.device)
+
+    def _begin_search(self) -> None:
+        """Launch the trial of the whole step in all worlds that run."""
+        self._measure_step(self.residual)
+        self._sums.take_in(int(kernels.STEP), int(kernels.REACH), most=True)
+        self._searching.zero_()
+        self._accepted.zero_()
+        outputs = [self._scalars, self.iterations, self.solved, self.status, self.running, self._searching]
+        self._sums.launch_scalars(kernels.begin_search, [self.solver.iterations], outputs)
+
+    def _measure_step(self, forces: wp.array) -> None:
+        """Launch the sums of a step, and of its product with forces."""
+        inputs = [self.body.conditions.mass, forces, self._outer, self.step, self.body.state.displacements]
+        columns = int(kernels.SLOPE), int(kernels.OUTER), int(kernels.INERTIA)
+        self._sums.launch(kernels.measure_step, inputs, *columns)
 
     def launch_residual(self) -> None:
         """Launch the unbalanced forces in the present state."""

@@ -28,13 +28,12 @@ if TYPE_CHECKING:
 
 
 class LinearisedStep:
-    """Solves for the increments of all bodies of a system.
+    """Solves for the increments of all bodies of a system that may touch something.
 
-    Without contact there is one linearisation, and its unknown is what increments change by. With contact they begin
-    with zero at free nodes, and the unknown of each linear problem is the whole motion d of the step: A d = r(d0) + A
-    d0 + contact, with the residual r and its derivative -A at the motion d0 so far. So contact has the same unknowns in
-    each of them. Where a scheme balances forces at a stage before the end of the step, increments are those of the
-    stage, a share of d. Contact is that of the end of the step, with its whole force in the balance.
+    Increments begin with zero at free nodes, and the unknown of each linear problem is the whole motion d of the step:
+    A d = r(d0) + A d0 + contact, with the residual r and its derivative -A at the motion d0 so far. So contact has the
+    same unknowns in each of them. Where a scheme balances forces at a stage before the end of the step, increments are
+    those of the stage, a share of d. Contact is that of the end of the step, with its whole force in the balance.
 
     Args:
         system: The linear system.
@@ -50,11 +49,9 @@ class LinearisedStep:
     def __init__(self, system: BlockSystem, newtons: list[Newton], *, tolerance: float | None, most: int):
         self._system, self._newtons, self.device = system, newtons, system.device
         self._tolerance, self._most = math.inf if tolerance is None else tolerance, 1 if tolerance is None else most
-        self._contact = None if system.contact is None else ContactSolve(system, newtons)
+        self._contact = ContactSolve(system, newtons)
         self.iterations = wp.ones(system.worlds, dtype=wp.int32, device=self.device)
-        self.linear_iterations, self.status = system.solver.iterations, system.solver.status
-        if self._contact is not None:
-            self.linear_iterations = self._contact.iterations
+        self.linear_iterations, self.status = self._contact.iterations, system.solver.status
         repeats = self._most > 1
         self._sizes = wp.zeros((system.worlds * repeats, kernels.COLUMNS), dtype=wp.float32, device=self.device)
         if repeats:
@@ -67,10 +64,6 @@ class LinearisedStep:
     def launch(self, offset: int) -> None:
         """Launch the increments and displacements of the ``offset``-th step, from a guess of the unknowns."""
         self._linearise()
-        if self._contact is None:
-            self._system.solve(guessed=True)
-            self._take_increments()
-            return
         self._contact.launch_begin(offset)
         self._contact.launch()
         self._take_increments()
@@ -89,7 +82,6 @@ class LinearisedStep:
         self._system.update()
 
     def _go_on(self) -> None:
-        assert self._contact is not None
         self._linearise()
         system = self._system
         for newton in self._newtons:
@@ -106,14 +98,13 @@ class LinearisedStep:
         ranks = self._system.ranks
         for newton in self._newtons:
             body = newton.body
-            inputs = [int(self._contact is None), newton.operator.node_count, body.conditions.inverse_mass]
+            inputs = [newton.operator.node_count, body.conditions.inverse_mass]
             inputs += [newton.base, newton.share, newton.step]
             self._launch(kernels.take_increments, inputs, [newton.increment, body.state.displacements, self._sizes])
             ranks.exchange(newton.operator.number, body.state.displacements)
 
     def _judge(self) -> None:
         """Launch the decision whether another linearisation follows."""
-        assert self._contact is not None
         self._system.ranks.max(self._sizes.flatten())
         self._going.zero_()
         inputs = [self._sizes, self._contact.iterations, self._system.solver.status, self._tolerance, self._most]
@@ -246,8 +237,9 @@ class StepSolve:
             self._make()
         if self.choice is not None:
             self.choice.is_open = all(suits(body.operator) for body in bodies)
+        self._linear_tolerance.fill_(self._shared.integrator.linear_tolerance)
         if self._linearised is not None:
-            self._system.solver.tolerance.fill_(self._shared.integrator.linear_tolerance)
+            wp.copy(self._system.solver.tolerance, self._linear_tolerance)
 
     def _make(self) -> None:
         """Make everything that depends on the meshes."""
@@ -265,7 +257,8 @@ class StepSolve:
             body.take_system(self._system, number)
         newtons = [body.newton for body in bodies]
         self._linearised: LinearisedStep | None = None
-        if self._touches or options.tolerance is None:
+        self._linear_tolerance = wp.zeros_like(self._system.solver.tolerance)
+        if self._touches:
             solve = self._linearised = LinearisedStep(
                 self._system, newtons, tolerance=options.tolerance, most=options.iterations
             )
@@ -299,6 +292,10 @@ class StepSolve:
     def _solve(self, offset: int) -> None:
         if self._linearised is None:
             newton = self._bodies[0].newton
+            if self._shared.integrator.tolerance is None:
+                newton.launch_only(self._linear_tolerance)
+                self._system.judge(*self._counts[1:3])
+                return
             newton.launch_begin()
             wp.capture_while(newton.running, newton.launch_iteration)
             return
