@@ -16,7 +16,7 @@ from gymnasium.utils.env_checker import check_env  # noqa: E402
 from gymnasium.vector import AutoresetMode  # noqa: E402
 
 import warp_corot as wc  # noqa: E402
-from warp_corot.envs import TASKS, FrankaLift, Lift, Reach, Retract, SingleEnv, Thread  # noqa: E402
+from warp_corot.envs import TASKS, Cut, FrankaLift, Lift, Reach, Retract, SingleEnv, Thread  # noqa: E402
 
 #: Those that need no robot.
 NAMES = [name for name, kind in TASKS.items() if kind is not FrankaLift]
@@ -326,6 +326,52 @@ def test_fast_thin_tools_have_more_implicit_steps(kind):
     env.reset(seed=0)
     env.step(np.ones((1, env.task.actions), np.float32))
     assert env.substeps > 2
+
+
+def cut_through(env, seed):
+    """The last step of an episode of the policy by hand, and the sum of rewards."""
+    observation, _ = env.reset(seed=seed)
+    total = 0.0
+    while True:
+        observation, reward, terminated, truncated, info = env.step(env.scripted_actions(observation))
+        total += reward
+        if terminated or truncated:
+            return observation, total, info["success"]
+
+
+def test_a_blade_cuts_along_a_line():
+    """In the whole way's area, with a reward that says how precisely, and twice the same from the same seed."""
+    env = Cut(device="cpu", threads=1)
+    observation, total, success = cut_through(env, 3)
+    assert success
+    assert env.body.pieces == 2
+    share, astray = observation[env.columns["share"]][0], observation[env.columns["astray"]][0]
+    assert share == pytest.approx(1.0, abs=0.1)
+    assert 10.0 < total < 20.0 * (1.0 - 0.1 * astray / 0.003)
+    np.testing.assert_array_equal(cut_through(env, 3)[0], observation)
+
+
+def test_a_cut_astray_ends_the_episode():
+    env = Cut(device="cpu", level=4, ranges={"front": (0.03, 0.03), "back": (0.03, 0.03), "start_x": (0.02, 0.02)})
+    env.reset(seed=0)
+    for _ in range(30):
+        _, _, terminated, _, info = env.step(np.float32([0.0, 1.0, 0.0]))
+        if terminated:
+            break
+    assert terminated
+    assert not info["success"]
+
+
+def test_the_environment_of_a_cut_passes_the_checker():
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        check_env(gymnasium.make("warp_corot/Cut-v0", device="cpu", level=4).unwrapped, skip_render_check=True)
+
+
+@pytest.mark.slow
+def test_a_blade_cuts_along_a_hundred_lines():
+    env = Cut(device="cpu")
+    assert sum(cut_through(env, seed)[2] for seed in range(1000, 1100)) >= 95
 
 
 @pytest.mark.slow  # MuJoCo-Warp is compiled for minutes
