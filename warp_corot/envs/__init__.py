@@ -13,12 +13,12 @@ from .blocks import Lift, Stack
 from .cut import Cut
 from .franka import FrankaLift
 from .single import SingleEnv
-from .soft_env import SoftEnv
+from .soft_env import RATE, SoftEnv
 from .task import Scene, Task
 from .tissue import Palpate, Reach, Retract, Thread
 
-__all__ = ["TASKS", "Cut", "FrankaLift", "Lift", "Palpate", "Reach", "Retract", "Scene", "SingleEnv", "SoftEnv"]
-__all__ += ["Stack", "Task", "Thread"]
+__all__ = ["RATE", "TASKS", "Cut", "FrankaLift", "Lift", "Palpate", "Reach", "Retract", "Scene", "SingleEnv"]
+__all__ += ["SoftEnv", "Stack", "Task", "Thread"]
 
 #: The environments of several worlds by their names in gymnasium.
 TASKS = {f"warp_corot/{kind.__name__}-v0": kind for kind in (Retract, Palpate, Reach, Lift, Thread, Stack, FrankaLift)}

@@ -51,7 +51,7 @@ class FrankaLift(Lift):
     """
 
     exchanges = EXCHANGES
-    task = replace(Lift.task, window=((-0.09, -0.08, 0.0), (0.12, 0.06, 0.2)), view=(25.0, 12.0))
+    task = replace(Lift.task, window=((-0.035, -0.02, 0.0), (0.065, 0.04, 0.1)), view=(25.0, 12.0))
 
     def _make_arrays(self, *, at_once: bool) -> None:
         super()._make_arrays(at_once=at_once)
