@@ -188,7 +188,14 @@ def test_numbers_are_drawn_within_their_ranges(device):
         assert (drawn[name] <= np.float32(high)).all()
     assert (drawn["goal_z"] == np.float32(0.03)).all()
     assert len(np.unique(drawn["young"])) > 60
+    kept = drawn["young"].copy()
+    env.reset(options={"reset_mask": np.zeros(64, bool)})
+    np.testing.assert_array_equal(env.drawn["young"], kept)
+    env.reset()
+    assert (env.drawn["young"] != kept).any()
+    np.testing.assert_array_equal(drawn["young"], kept)  # not a view
     # What the tissue is made of.
+    drawn = env.drawn
     mu = env.sim.body.discretization.mu.numpy().reshape(64, -1)
     np.testing.assert_allclose(mu, np.broadcast_to(drawn["young"][:, None] / 2.8, mu.shape), rtol=1e-6)
 

@@ -259,7 +259,7 @@ class SoftEnv(VectorEnv):
     @property
     def drawn(self) -> dict[str, npt.NDArray[np.float32]]:
         """The drawn numbers of the present episodes, float32 [worlds] each; waits for the device."""
-        return dict(zip(self.ranges, self.worlds.draws.numpy().T, strict=True))
+        return dict(zip(self.ranges, self.worlds.draws.numpy().T.copy(), strict=True))
 
     @property
     def _steering(self) -> list:
