@@ -1,8 +1,8 @@
 """A policy learns a task by proximal policy optimisation of skrl, all on one device.
 
-Observations, actions and rewards stay on the device of the environments. It needs `pip install "warp-corot[envs]" torch
-skrl`. Each line says how many steps all worlds have made, the mean reward of a step, and how many of the episodes that
-ended succeeded.
+Observations, actions and rewards stay on the device of the environments. It needs `pip install
+"warp-corot[envs,torch]" skrl`. Each line says how many steps all worlds have made, the mean reward of a step, and how
+many of the episodes that ended succeeded.
 """
 
 import argparse
