@@ -31,6 +31,7 @@ parser.add_argument("--steps", type=int, default=64, help="steps of a rollout")
 parser.add_argument("--minutes", type=float, default=math.inf, help="no rollout begins after so long")
 parser.add_argument("--seed", type=int, default=0)
 parser.add_argument("-o", "--output", help="a file for the policy (.pt)")
+parser.add_argument("--plot", help="a picture of rewards and successes over steps (.png); it needs matplotlib")
 args = parser.parse_args()
 
 set_seed(args.seed)
@@ -92,7 +93,7 @@ agent.cfg.experiment.write_interval = agent.cfg.experiment.checkpoint_interval =
 agent.init()
 agent.enable_training_mode(True)
 
-start = time.perf_counter()
+start, curve = time.perf_counter(), []
 for rollout in range(args.rollouts):
     if time.perf_counter() - start > 60.0 * args.minutes:
         break
@@ -116,10 +117,21 @@ for rollout in range(args.rollouts):
         agent.post_interaction(**now)
     made, took = (rollout + 1) * args.steps * args.worlds, time.perf_counter() - start
     mean = float(torch.stack(rewards).mean())
+    curve.append((made, mean, succeeded / ended if ended else math.nan))
     share = f"{100 * succeeded / ended:3.0f} % of {ended:4} episodes" if ended else "no episode ended"
     print(f"{made:8} steps, {took:6.0f} s: reward {mean:7.3f}, success {share}", flush=True)
 
 if args.output:
     agent.save(args.output)
     print(f"wrote {args.output}")
+if args.plot:
+    import matplotlib.pyplot as plt
+
+    steps, *rows = zip(*curve, strict=True)
+    fig, axes = plt.subplots(1, 2, figsize=(8, 2.6), layout="constrained")
+    for each, values, label in zip(axes, rows, ("mean reward of a step", "share of successes"), strict=True):
+        each.plot([made / 1000 for made in steps], values, ".-")
+        each.set(xlabel="thousand steps of all worlds", ylabel=label)
+        each.grid(alpha=0.3)
+    fig.savefig(args.plot, dpi=110)
 assert math.isfinite(mean)
