@@ -31,6 +31,8 @@ SHEET, SPEED = (0.048, 0.032, 0.016), 0.06
 EDGE = (-0.004, 0.03)
 #: Mean distances of the cut from the line with which it succeeds, and at which it has failed [m].
 PRECISE, ASTRAY = 0.001, 0.003
+#: The least share of the way that is cut when the tissue has come apart.
+WHOLE = 0.9
 
 
 class Cut(gymnasium.Env[Actions, Actions]):
@@ -77,13 +79,9 @@ class Cut(gymnasium.Env[Actions, Actions]):
     ):
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise InputError(f"render_mode is {shown(render_mode)}; it must be 'rgb_array' or None")
-        self.ranges, self.device, self.render_mode = (
-            checked_ranges(self.RANGES, ranges),
-            checked_device(device),
-            render_mode,
-        )
+        self.ranges, self.device = checked_ranges(self.RANGES, ranges), checked_device(device)
         self.max_episode_steps = checked_count(max_episode_steps, "max_episode_steps", least=1)
-        self._threads, self._level = threads, level
+        self.render_mode, self._threads, self._level = render_mode, threads, level
         parts = {f"tool0.{name}": 3 for name in TOOL_PARTS}
         self.columns = columns_of({**parts, "line": 6, "time": 1, "share": 1, "astray": 1})
         self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (3,), np.float32)
@@ -128,16 +126,11 @@ class Cut(gymnasium.Env[Actions, Actions]):
         if gain > 0.0:
             self._astray = self._mean_distance()
         fails = self._astray > ASTRAY
-        success = self.body.pieces > 1 and self._astray < PRECISE
+        # Not a crumb.
+        success = self.body.pieces > 1 and share > WHOLE and self._astray < PRECISE
         reward = 10.0 * gain * (1.0 - self._astray / ASTRAY) - 0.02 + 10.0 * success
-        is_over = bool(success or fails)
-        return (
-            self._observed(),
-            reward,
-            is_over,
-            self._step >= self.max_episode_steps and not is_over,
-            {"success": success},
-        )
+        is_over, is_late = bool(success or fails), self._step >= self.max_episode_steps
+        return self._observed(), reward, is_over, is_late and not is_over, {"success": success}
 
     def render(self) -> npt.NDArray[np.uint8] | None:
         """A picture, uint8 [height, width, 3]; None without a render mode."""
