@@ -10,26 +10,28 @@ from pathlib import Path
 from PIL import Image
 
 from warp_corot.envs import TASKS as KINDS
+from warp_corot.envs import Cut, SingleEnv
 
 IMAGES = Path(__file__).resolve().parent
 #: Steps from one picture to the next, most frames and colours of a film, and the time that each frame is shown [ms].
 EVERY, MOST, COLORS, SHOWN = 4, 22, 32, 100
 #: Seed of the episodes that are shown.
 SEED = 3
-TASKS = {kind.__name__.lower(): kind for kind in KINDS.values()}
+TASKS = {kind.__name__.lower(): kind for kind in (*KINDS.values(), Cut)}
 
 
 def frames(kind):
     """Pictures of an episode."""
-    env = kind(1, device="cpu", render_mode="rgb_array")
-    observations, _ = env.reset(seed=SEED)
-    found, over, step = [env.render()[0]], False, 0
+    options = {"device": "cpu", "render_mode": "rgb_array"}
+    env = Cut(**options) if kind is Cut else SingleEnv(kind, **options)
+    observation, _ = env.reset(seed=SEED)
+    found, over, step = [env.render()], False, 0
     while not over:
-        observations, _, terminated, truncated, info = env.step(env.scripted_actions(observations))
-        over, step = terminated[0] or truncated[0], step + 1
+        observation, _, terminated, truncated, info = env.step(env.scripted_actions(observation))
+        over, step = terminated or truncated, step + 1
         if step % EVERY == 0 or over:
-            found.append(env.render()[0])
-    print(f"{kind.__name__}: {step} steps, success {info['success'][0]}", flush=True)
+            found.append(env.render())
+    print(f"{kind.__name__}: {step} steps, success {info['success']}", flush=True)
     return [Image.fromarray(each) for each in found]
 
 

@@ -1,22 +1,26 @@
-"""A policy learns a task by proximal policy optimisation (Schulman et al. 2017), all on one device, in PyTorch.
+"""A policy learns a task by proximal policy optimisation of skrl, all on one device.
 
-The method is written out in short. Observations, actions and rewards stay on the device of the environments. It needs
-`pip install "warp-corot[envs,torch]"`. Each line says how many steps all worlds have made, the mean reward of a step,
-and how many of the episodes that ended succeeded.
+Observations, actions and rewards stay on the device of the environments. It needs `pip install
+"warp-corot[envs,torch]" skrl`. Each line says how many steps all worlds have made, the mean reward of a step, and how
+many of the episodes that ended succeeded.
 """
 
 import argparse
+import math
 import time
-
-import numpy as np
 
 from warp_corot import envs
 
 try:
     import torch
+    from skrl.agents.torch.ppo import PPO
+    from skrl.memories.torch import RandomMemory
+    from skrl.models.torch import DeterministicMixin, GaussianMixin, Model
+    from skrl.resources.preprocessors.torch import RunningStandardScaler
+    from skrl.utils import set_seed
     from torch import nn
 except ImportError:
-    raise SystemExit('this example needs PyTorch: pip install "warp-corot[torch]"') from None
+    raise SystemExit("this example needs PyTorch and skrl: pip install torch skrl") from None
 
 parser = argparse.ArgumentParser(description=__doc__)
 parser.add_argument("--task", default="Reach", choices=[kind.__name__ for kind in envs.TASKS.values()])
@@ -24,97 +28,110 @@ parser.add_argument("--device", help="cpu or cuda:0")
 parser.add_argument("--worlds", type=int, default=64)
 parser.add_argument("--rollouts", type=int, default=24, help="rollouts, each with an update")
 parser.add_argument("--steps", type=int, default=64, help="steps of a rollout")
+parser.add_argument("--minutes", type=float, default=math.inf, help="no rollout begins after so long")
 parser.add_argument("--seed", type=int, default=0)
 parser.add_argument("-o", "--output", help="a file for the policy (.pt)")
+parser.add_argument("--plot", help="a picture of rewards and successes over steps (.png); it needs matplotlib")
 args = parser.parse_args()
 
-DISCOUNT, TRACE, CLIP, EPOCHS, BATCHES, RATE, ENTROPY = 0.98, 0.95, 0.2, 5, 4, 1e-3, 1e-3
-
-torch.manual_seed(args.seed)
-kind = getattr(envs, args.task)
-env = kind(args.worlds, array="torch", autoreset="same_step", device=args.device)
+set_seed(args.seed)
+env = getattr(envs, args.task)(args.worlds, array="torch", autoreset="same_step", device=args.device)
 observations, _ = env.reset(seed=args.seed)
 device = observations.device
-inputs, outputs = env.observation_space.shape[1], env.action_space.shape[1]
+spaces = {"observation_space": env.single_observation_space, "action_space": env.single_action_space}
 
 
-class Normaliser:
-    """Observations with the mean and the deviation that all so far have had."""
+def network(outputs):
+    inputs = spaces["observation_space"].shape[0]
+    return nn.Sequential(nn.Linear(inputs, 128), nn.Tanh(), nn.Linear(128, 128), nn.Tanh(), nn.Linear(128, outputs))
 
+
+class Policy(GaussianMixin, Model):
     def __init__(self):
-        self.count, self.mean, self.square = 1e-4, torch.zeros(inputs, device=device), torch.ones(inputs, device=device)
+        Model.__init__(self, **spaces, device=device)
+        GaussianMixin.__init__(self)
+        self.mean = network(self.num_actions)
+        self.log_deviation = nn.Parameter(torch.full((self.num_actions,), -0.7))
+        with torch.no_grad():
+            self.mean[-1].weight *= 0.01
 
-    def update(self, given):
-        share = len(given) / (self.count + len(given))
-        self.count += len(given)
-        self.mean += share * (given.mean(dim=0) - self.mean)
-        self.square += share * ((given**2).mean(dim=0) - self.square)
-
-    def __call__(self, given):
-        deviation = (self.square - self.mean**2).clamp(min=0.0).sqrt()
-        return ((given - self.mean) / (deviation + 1e-4)).clamp(-5.0, 5.0)
+    def compute(self, inputs, role):
+        return self.mean(inputs["observations"]), {"log_std": self.log_deviation}
 
 
-def network(size):
-    return nn.Sequential(nn.Linear(inputs, 128), nn.Tanh(), nn.Linear(128, 128), nn.Tanh(), nn.Linear(128, size))
+class Value(DeterministicMixin, Model):
+    def __init__(self):
+        Model.__init__(self, **spaces, device=device)
+        DeterministicMixin.__init__(self)
+        self.value = network(1)
+
+    def compute(self, inputs, role):
+        return self.value(inputs["observations"]), {}
 
 
-normalise = Normaliser()
-actor, critic = network(outputs).to(device), network(1).to(device)
-with torch.no_grad():
-    actor[-1].weight *= 0.01
-spread = nn.Parameter(torch.full((outputs,), -0.7, device=device))
-parameters = [*actor.parameters(), *critic.parameters(), spread]
-optimiser = torch.optim.Adam(parameters, lr=RATE)
+agent = PPO(
+    models={"policy": Policy().to(device), "value": Value().to(device)},
+    memory=RandomMemory(memory_size=args.steps, num_envs=args.worlds, device=device),
+    cfg={
+        "rollouts": args.steps,
+        "learning_epochs": 5,
+        "mini_batches": 4,
+        "discount_factor": 0.98,
+        "entropy_loss_scale": 1e-3,
+        "value_loss_scale": 0.5,
+        "value_clip": 0.0,
+        "time_limit_bootstrap": True,
+        "observation_preprocessor": RunningStandardScaler,
+        "observation_preprocessor_kwargs": {"size": spaces["observation_space"], "device": device},
+        "value_preprocessor": RunningStandardScaler,
+        "value_preprocessor_kwargs": {"size": 1, "device": device},
+    },
+    device=device,
+    **spaces,
+)
+agent.cfg.experiment.write_interval = agent.cfg.experiment.checkpoint_interval = 0
+agent.init()
+agent.enable_training_mode(True)
 
-
-def policy(seen):
-    return torch.distributions.Normal(actor(seen), spread.exp())
-
-
-start = time.perf_counter()
+start, curve = time.perf_counter(), []
 for rollout in range(args.rollouts):
-    seen, done, chance, value, gain, ends, following = ([] for _ in range(7))
-    ended = succeeded = 0
-    with torch.no_grad():
-        for _ in range(args.steps):
-            normalise.update(observations)
-            seen.append(normalise(observations))
-            distribution = policy(seen[-1])
-            done.append(distribution.sample())
-            chance.append(distribution.log_prob(done[-1]).sum(dim=1))
-            value.append(critic(seen[-1])[:, 0])
-            observations, reward, terminated, truncated, info = env.step(done[-1])
-            gain.append(reward)
-            ends.append((terminated | truncated).float())
-            # An episode that is cut off would have gone on; one that is over has nothing more to gain.
-            following.append(critic(normalise(info["final_obs"]))[:, 0] * (~terminated).float())
-            ended += int(ends[-1].sum())
+    if time.perf_counter() - start > 60.0 * args.minutes:
+        break
+    rewards, ended, succeeded = [], 0, 0
+    for step in range(rollout * args.steps, (rollout + 1) * args.steps):
+        now = {"timestep": step, "timesteps": args.rollouts * args.steps}
+        with torch.no_grad():
+            actions, _ = agent.act(observations, None, **now)
+            following, reward, terminated, truncated, info = env.step(actions)
+            rewards.append(reward.mean())
+            ended += int((terminated | truncated).sum())
             succeeded += int(info["success"].sum())
-        advantage, trace = [], torch.zeros(args.worlds, device=device)
-        for k in reversed(range(args.steps)):
-            trace = gain[k] + DISCOUNT * following[k] - value[k] + DISCOUNT * TRACE * (1.0 - ends[k]) * trace
-            advantage.insert(0, trace)
-    given, acted, before, gains, values = (torch.cat(each) for each in (seen, done, chance, advantage, value))
-    target, gains = gains + values, (gains - gains.mean()) / (gains.std() + 1e-8)
-    for _ in range(EPOCHS):
-        for chosen in torch.randperm(len(given), device=device).chunk(BATCHES):
-            distribution = policy(given[chosen])
-            ratio = (distribution.log_prob(acted[chosen]).sum(dim=1) - before[chosen]).exp()
-            surrogate = torch.minimum(ratio * gains[chosen], ratio.clamp(1 - CLIP, 1 + CLIP) * gains[chosen])
-            error = (critic(given[chosen])[:, 0] - target[chosen]) ** 2
-            loss = -surrogate.mean() + 0.5 * error.mean() - ENTROPY * distribution.entropy().sum(dim=1).mean()
-            optimiser.zero_grad()
-            loss.backward()
-            nn.utils.clip_grad_norm_(parameters, 0.5)
-            optimiser.step()
+            # What follows is the end of an episode, not the beginning of the next.
+            agent.record_transition(
+                **{"observations": observations, "states": None, "actions": actions, "rewards": reward[:, None]},
+                **{"next_observations": info["final_obs"], "next_states": None, "infos": info},
+                **{"terminated": terminated[:, None], "truncated": truncated[:, None]},
+                **now,
+            )
+            observations = following
+        agent.post_interaction(**now)
     made, took = (rollout + 1) * args.steps * args.worlds, time.perf_counter() - start
-    mean = float(torch.stack(gain).mean())
+    mean = float(torch.stack(rewards).mean())
+    curve.append((made, mean, succeeded / ended if ended else math.nan))
     share = f"{100 * succeeded / ended:3.0f} % of {ended:4} episodes" if ended else "no episode ended"
     print(f"{made:8} steps, {took:6.0f} s: reward {mean:7.3f}, success {share}", flush=True)
 
 if args.output:
-    state = {"actor": actor.state_dict(), "mean": normalise.mean, "square": normalise.square}
-    torch.save(state, args.output)
+    agent.save(args.output)
     print(f"wrote {args.output}")
-assert np.isfinite(mean)
+if args.plot:
+    import matplotlib.pyplot as plt
+
+    steps, *rows = zip(*curve, strict=True)
+    fig, axes = plt.subplots(1, 2, figsize=(8, 2.6), layout="constrained")
+    for each, values, label in zip(axes, rows, ("mean reward of a step", "share of successes"), strict=True):
+        each.plot([made / 1000 for made in steps], values, ".-")
+        each.set(xlabel="thousand steps of all worlds", ylabel=label)
+        each.grid(alpha=0.3)
+    fig.savefig(args.plot, dpi=110)
+assert math.isfinite(mean)

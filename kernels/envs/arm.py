@@ -45,73 +45,54 @@ def joint_angles(x: wp.vec3):
     return q
 
 
+@wp.struct
+class Arms:
+    """The arms of all worlds, [W], with nine joints each."""
+
+    base: wp.transform  # pose of each base
+    thickness: float  # of a finger [m]
+    aims: wp.array[wp.vec4]  # wanted middle of the fingers, and distance of their centres [m]
+    wanted: wp.array[wp.float32]  # what controllers want of joints [rad], and of fingers [m]
+    q: wp.array[wp.float32]  # how joints are
+    qd: wp.array[wp.float32]  # and their rates [1/s]
+
+
 @wp.func
-def aim_joints(w: int, base: wp.transform, aim: wp.vec4, thickness: float, joints: wp.array[wp.float32]):
-    """Write joint angles for a place of the fingers' middle and a distance of their centres [m]."""
-    x = wp.transform_point(wp.transform_inverse(base), wp.vec3(aim[0], aim[1], aim[2]))
-    q = joint_angles(x)
+def aim_joints(w: int, arms: Arms, joints: wp.array[wp.float32]):
+    """Write joint angles for the aim of an arm."""
+    aim = arms.aims[w]
+    q = joint_angles(wp.transform_point(wp.transform_inverse(arms.base), wp.vec3(aim[0], aim[1], aim[2])))
     for k in range(JOINTS):
         joints[ALL * w + k] = q[k]
-    for k in range(2):
-        joints[ALL * w + JOINTS + k] = 0.5 * (aim[3] - thickness)
+    for k in range(JOINTS, ALL):
+        joints[ALL * w + k] = 0.5 * (aim[3] - arms.thickness)
 
 
 @wp.kernel(enable_backward=False)
-def begin_arm(
-    # In
-    chosen: wp.array[wp.int32],
-    base: wp.transform,
-    thickness: float,
-    worlds: Worlds,
-    # Out
-    aims: wp.array[wp.vec4],
-    wanted: wp.array[wp.float32],
-    q: wp.array[wp.float32],
-    qd: wp.array[wp.float32],
-):
-    """Put the arms of chosen worlds at rest where their episodes place the fingers.
-
-    Args:
-        base: Pose of the arms.
-        thickness: Of a finger [m].
-        aims: Middle of the fingers and distance of their centres [m], [W].
-        wanted, q, qd: Angles that the controller wants, angles and their rates.
-    """
+def begin_arms(chosen: wp.array[wp.int32], arms: Arms, worlds: Worlds):
+    """Put the arms of chosen worlds at rest where their episodes place the fingers."""
     w = wp.tid()
     if chosen[w] == 0:
         return
     a = wp.transform_get_translation(worlds.targets[0, w])
     b = wp.transform_get_translation(worlds.targets[1, w])
     middle = 0.5 * (a + b)
-    aims[w] = wp.vec4(middle[0], middle[1], middle[2], b[0] - a[0])
-    aim_joints(w, base, aims[w], thickness, wanted)
-    aim_joints(w, base, aims[w], thickness, q)
+    arms.aims[w] = wp.vec4(middle[0], middle[1], middle[2], b[0] - a[0])
+    aim_joints(w, arms, arms.wanted)
+    aim_joints(w, arms, arms.q)
     for k in range(ALL):
-        qd[ALL * w + k] = 0.0
+        arms.qd[ALL * w + k] = 0.0
 
 
 @wp.kernel(enable_backward=False)
-def steer_arm(
-    # In
-    far: float,
-    low: wp.vec3,
-    high: wp.vec3,
-    narrow: float,
-    wide: float,
-    base: wp.transform,
-    thickness: float,
-    worlds: Worlds,
-    # Out
-    aims: wp.array[wp.vec4],
-    wanted: wp.array[wp.float32],
-):
-    """Change what the controller wants by actions, as ``episodes.steer_fingers`` moves free fingers."""
+def steer_arms(far: float, low: wp.vec3, high: wp.vec3, narrow: float, wide: float, arms: Arms, worlds: Worlds):
+    """Change what controllers want by actions, as ``episodes.steer_fingers`` moves free fingers."""
     w = wp.tid()
-    aim = aims[w]
+    aim = arms.aims[w]
     way = far * wp.vec3(action(worlds, w, 0), action(worlds, w, 1), action(worlds, w, 2))
     x = within(wp.vec3(aim[0], aim[1], aim[2]) + way, low, high)
-    aims[w] = wp.vec4(x[0], x[1], x[2], wp.clamp(aim[3] + 2.0 * far * action(worlds, w, 3), narrow, wide))
-    aim_joints(w, base, aims[w], thickness, wanted)
+    arms.aims[w] = wp.vec4(x[0], x[1], x[2], wp.clamp(aim[3] + 2.0 * far * action(worlds, w, 3), narrow, wide))
+    aim_joints(w, arms, arms.wanted)
 
 
 @wp.kernel(enable_backward=False)

@@ -37,14 +37,17 @@ def begin_retraction(chosen: wp.array[wp.int32], site: wp.vec3, worlds: Worlds):
 
 
 @wp.kernel(enable_backward=False)
-def judge_retraction(near: float, hold: int, bonus: float, worlds: Worlds):
-    """Judge by the distances of the gripper from the rim, and of the rim from its goal."""
+def judge_retraction(near: float, reach: float, hold: int, bonus: float, worlds: Worlds):
+    """Judge by the distances of the gripper from the rim, and of the rim from its goal, and by whether the gripper is
+    closed within its ``reach`` of the rim [m].
+    """
     w = wp.tid()
     site = seen(worlds, w, OF_TOOL)
     to_site = wp.length(seen(worlds, w, POSITION) - site)
     to_goal = wp.length(site - wp.vec3(worlds.notes[w, 0], worlds.notes[w, 1], worlds.notes[w, 2]))
     worlds.notes[w, 3] = float(worlds.closed[w])
-    reward = -0.1 * (to_site + 2.0 * to_goal) / 0.05
+    held = worlds.closed[w] != 0 and to_site < reach
+    reward = -0.1 * (to_site + 2.0 * to_goal) / 0.05 - wp.where(held, 0.0, 0.1)
     conclude(worlds, w, reward, to_goal < near, hold, bonus, False)
 
 

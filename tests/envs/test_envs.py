@@ -16,7 +16,7 @@ from gymnasium.utils.env_checker import check_env  # noqa: E402
 from gymnasium.vector import AutoresetMode  # noqa: E402
 
 import warp_corot as wc  # noqa: E402
-from warp_corot.envs import TASKS, FrankaLift, Lift, Reach, Retract, SingleEnv, Thread  # noqa: E402
+from warp_corot.envs import TASKS, Cut, FrankaLift, Lift, Reach, Retract, SingleEnv, Thread  # noqa: E402
 
 #: Those that need no robot.
 NAMES = [name for name, kind in TASKS.items() if kind is not FrankaLift]
@@ -188,7 +188,14 @@ def test_numbers_are_drawn_within_their_ranges(device):
         assert (drawn[name] <= np.float32(high)).all()
     assert (drawn["goal_z"] == np.float32(0.03)).all()
     assert len(np.unique(drawn["young"])) > 60
+    kept = drawn["young"].copy()
+    env.reset(options={"reset_mask": np.zeros(64, bool)})
+    np.testing.assert_array_equal(env.drawn["young"], kept)
+    env.reset()
+    assert (env.drawn["young"] != kept).any()
+    np.testing.assert_array_equal(drawn["young"], kept)  # not a view
     # What the tissue is made of.
+    drawn = env.drawn
     mu = env.sim.body.discretization.mu.numpy().reshape(64, -1)
     np.testing.assert_allclose(mu, np.broadcast_to(drawn["young"][:, None] / 2.8, mu.shape), rtol=1e-6)
 
@@ -328,11 +335,71 @@ def test_fast_thin_tools_have_more_implicit_steps(kind):
     assert env.substeps > 2
 
 
+def cut_through(env, seed):
+    """The last step of an episode of the policy by hand, and the sum of rewards."""
+    observation, _ = env.reset(seed=seed)
+    total = 0.0
+    while True:
+        observation, reward, terminated, truncated, info = env.step(env.scripted_actions(observation))
+        total += reward
+        if terminated or truncated:
+            return observation, total, info["success"]
+
+
+def test_a_blade_cuts_along_a_line():
+    """In the whole way's area, with a reward that says how precisely, and twice the same from the same seed."""
+    env = Cut(device="cpu", threads=1)
+    observation, total, success = cut_through(env, 3)
+    assert success
+    assert env.body.pieces == 2
+    share, astray = observation[env.columns["share"]][0], observation[env.columns["astray"]][0]
+    assert share == pytest.approx(1.0, abs=0.1)
+    assert 10.0 < total < 20.0 * (1.0 - 0.1 * astray / 0.003)
+    np.testing.assert_array_equal(cut_through(env, 3)[0], observation)
+
+
+def test_a_cut_astray_ends_the_episode():
+    env = Cut(device="cpu", level=4, ranges={"front": (0.03, 0.03), "back": (0.03, 0.03), "start_x": (0.02, 0.02)})
+    env.reset(seed=0)
+    for _ in range(30):
+        _, _, terminated, _, info = env.step(np.float32([0.0, 1.0, 0.0]))
+        if terminated:
+            break
+    assert terminated
+    assert not info["success"]
+
+
+def test_the_environment_of_a_cut_passes_the_checker():
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        check_env(gymnasium.make("warp_corot/Cut-v0", device="cpu", level=4).unwrapped, skip_render_check=True)
+
+
+@pytest.mark.slow
+def test_a_blade_cuts_along_a_hundred_lines():
+    env = Cut(device="cpu")
+    assert sum(cut_through(env, seed)[2] for seed in range(1000, 1100)) >= 95
+
+
 @pytest.mark.slow  # MuJoCo-Warp is compiled for minutes
 def test_an_arm_lifts_a_block(device):
     pytest.importorskip("mujoco_warp")
     env = FrankaLift(8, device=device)
     assert succeeded(env, seed=0).sum() >= 7
+    # It bears the block's weight, and its fingers give way as the stiffness of their motors says.
+    env = FrankaLift(1, device=device)
+    observations, _ = env.reset(seed=0)
+    for _ in range(70):
+        observations, *_ = env.step(env.scripted_actions(observations))
+    for _ in range(20):
+        observations, *_ = env.step(np.zeros((1, 4), np.float32))
+    left, right, push, pull = env.seen(
+        observations, *(f"tool{k}.{name}" for name in ("position", "force") for k in (0, 1))
+    )
+    assert env.middles(observations)[0, 0, 2] > 0.02
+    assert -(push + pull)[0, 2] == pytest.approx(9.81 * env.sim.body.masses.sum(), rel=0.05)
+    apart = (right - left)[0, 0] - env._arms.aims.numpy()[0, 3]
+    assert 1000.0 * apart == pytest.approx(0.5 * (pull - push)[0, 0], rel=0.05)
     check_env(gymnasium.make("warp_corot/FrankaLift-v0", device=device).unwrapped, skip_render_check=True)
 
 
@@ -351,10 +418,11 @@ def test_a_single_environment_is_a_world():
 def test_the_example_trains(device, tmp_path, monkeypatch, capsys):
     """A short run: whether a policy learns shows in a long one only."""
     torch = pytest.importorskip("torch")
+    pytest.importorskip("skrl")
     script, output = Path(__file__).parents[2] / "examples" / "learning" / "train_ppo.py", tmp_path / "policy.pt"
     options = ["--device", device, "--worlds", "4", "--rollouts", "2", "--steps", "8", "-o", str(output)]
     monkeypatch.setattr(sys, "argv", [str(script), *options])
     runpy.run_path(str(script), run_name="__main__")
     lines = [line for line in capsys.readouterr().out.splitlines() if "success" in line or "no episode" in line]
     assert len(lines) == 2
-    assert {"actor", "mean", "square"} == set(torch.load(output))
+    assert {"policy", "value", "observation_preprocessor"} <= set(torch.load(output, weights_only=False))

@@ -32,6 +32,8 @@ ORIGINS = (
     *(((kernels.BESIDE, 0.0, 0.0), 1), ((-kernels.BESIDE, kernels.FORE, 0.0), -1), ((0.0, 0.0, 0.0), 1)),
     ((kernels.WRIST, 0.0, 0.0), 1),
 )
+#: What Newton calls the numbers of a controller.
+MOTOR = ("target_ke", "target_kd", "effort_limit")
 #: The controller of each joint: stiffness [N m/rad], damping [N m s/rad] and largest torque [N m].
 GAINS = (*((4500.0, 160.0, 87.0),) * 2, *((3500.0, 120.0, 87.0),) * 2, *((2000.0, 50.0, 12.0),) * 3)
 #: The same of a finger [N/m, N s/m, N], its mass [kg], and the inertia of motors at joints [kg m^2] and fingers [kg].
@@ -51,7 +53,7 @@ class FrankaLift(Lift):
     """
 
     exchanges = EXCHANGES
-    task = replace(Lift.task, window=((-0.09, -0.08, 0.0), (0.12, 0.06, 0.2)), view=(25.0, 12.0))
+    task = replace(Lift.task, window=((-0.035, -0.02, 0.0), (0.065, 0.04, 0.1)), view=(25.0, 12.0))
 
     def _make_arrays(self, *, at_once: bool) -> None:
         super()._make_arrays(at_once=at_once)
@@ -64,8 +66,11 @@ class FrankaLift(Lift):
         model = builder.finalize(device=self.device)
         options = {"integrator": "implicitfast", "disable_contacts": True, "iterations": 10, "ls_iterations": 10}
         self.robot = newton.solvers.SolverMuJoCo(model, **options)
-        self._states, self._control = [model.state(), model.state()], model.control()
-        self._aims = wp.zeros(self.num_envs, dtype=wp.vec4, device=self.device)
+        self._states, self._control = (model.state(), model.state()), model.control()
+        arms = self._arms = kernels.Arms()
+        arms.base, arms.thickness = BASE, FINGER[0]
+        arms.aims = wp.zeros(self.num_envs, dtype=wp.vec4, device=self.device)
+        arms.wanted, arms.q, arms.qd = self._control.joint_target_q, self._states[0].joint_q, self._states[0].joint_qd
         self._bodies = model.body_count // self.num_envs
         self._fingers = wp.vec2i(self._bodies - 2, self._bodies - 1)
 
@@ -73,43 +78,33 @@ class FrankaLift(Lift):
     def _arm(newton):
         """A builder of the arm."""
         builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
-        parent, joints, position = -1, [], newton.JointTargetMode.POSITION
-        for (mass, centre), (place, turns), (stiffness, damping, most) in zip(LINKS, ORIGINS, GAINS, strict=True):
+        parent, joints = -1, list[int]()
+        common = {"armature": ARMATURE, "actuator_mode": newton.JointTargetMode.POSITION}
+        for (mass, centre), (place, turns), gains in zip(LINKS, ORIGINS, GAINS, strict=True):
             link = builder.add_link(mass=mass, com=centre, inertia=wp.mat33(np.eye(3) * 0.005 * mass))
             pose = wp.transform(place, wp.quat_from_axis_angle(wp.vec3(1.0, 0.0, 0.0), 0.5 * np.pi * turns))
-            joint = builder.add_joint_revolute(
-                *(parent, link),
-                parent_xform=BASE * pose if parent < 0 else pose,
-                axis=(0.0, 0.0, 1.0),
-                **{"target_ke": stiffness, "target_kd": damping, "effort_limit": most, "armature": ARMATURE},
-                actuator_mode=position,
+            options = dict(zip(MOTOR, gains, strict=True), axis=(0.0, 0.0, 1.0), **common)
+            joints.append(
+                builder.add_joint_revolute(parent, link, parent_xform=pose if joints else BASE * pose, **options)
             )
-            joints.append(joint)
             parent = link
         # Frames of the fingers are the world's while they point down; the hand is turned by an eighth of a turn.
         hand = wp.quat_to_matrix(wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), -0.25 * np.pi))
         down = wp.quat_from_matrix(hand @ wp.mat33(0.0, 1.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, -1.0))
-        stiffness, damping, most = GRIP
         for side in (-1.0, 1.0):
-            inertia = np.diag([b * b + c * c for b, c in ((FINGER[1], FINGER[2]), (FINGER[0], FINGER[2]), FINGER[:2])])
-            link = builder.add_link(mass=FINGER_MASS, inertia=wp.mat33(inertia * FINGER_MASS / 12.0))
-            place = wp.transform((0.0, 0.0, kernels.TIPS), down)
+            link = builder.add_link(mass=FINGER_MASS, inertia=wp.mat33(np.eye(3) * 1e-6))
             closed = wp.transform((0.5 * side * FINGER[0], 0.0, 0.0), wp.quat_identity())
-            joint = builder.add_joint_prismatic(
-                *(parent, link),
-                parent_xform=place * closed,
-                axis=(side, 0.0, 0.0),
-                **{"target_ke": stiffness, "target_kd": damping, "effort_limit": most, "armature": ARMATURE},
-                **{"limit_lower": 0.0, "limit_upper": 0.04},
-                actuator_mode=position,
+            pose = wp.transform((0.0, 0.0, kernels.TIPS), down) * closed
+            options = dict(
+                zip(MOTOR, GRIP, strict=True), axis=(side, 0.0, 0.0), limit_lower=0.0, limit_upper=0.04, **common
             )
-            joints.append(joint)
+            joints.append(builder.add_joint_prismatic(parent, link, parent_xform=pose, **options))
         builder.add_articulation(joints)
         return builder
 
     def launch_actions(self) -> None:
-        inputs = [*self._steering, NARROW, WIDE, BASE, FINGER[0], self.worlds, self._aims]
-        self._launch(kernels.steer_arm, self.num_envs, [*inputs, self._control.joint_target_q])
+        inputs = [*self._steering, NARROW, WIDE, self._arms, self.worlds]
+        self._launch(kernels.steer_arms, self.num_envs, inputs)
 
     def launch_exchange(self) -> None:
         """Step the arm under the forces on its fingers, and send the tools to where these are then."""
@@ -123,10 +118,7 @@ class FrankaLift(Lift):
         self._launch(kernels.take_poses, (2, self.num_envs), taken)
 
     def launch_places(self, chosen: wp.array) -> None:
-        state = self._states[0]
-        inputs = [chosen, BASE, FINGER[0], self.worlds, self._aims]
-        outputs = [self._control.joint_target_q, state.joint_q, state.joint_qd]
-        self._launch(kernels.begin_arm, self.num_envs, [*inputs, *outputs])
+        self._launch(kernels.begin_arms, self.num_envs, [chosen, self._arms, self.worlds])
         super().launch_places(chosen)
 
     def decorations(self, world: int) -> Iterator[tuple[Shape, npt.NDArray[np.float64]]]:

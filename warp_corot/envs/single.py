@@ -9,9 +9,10 @@ import numpy as np
 import numpy.typing as npt
 
 from .soft_env import SoftEnv
+from .task import Actions
 
 
-class SingleEnv(gymnasium.Env[npt.NDArray[np.float32], npt.NDArray[np.float32]]):
+class SingleEnv(gymnasium.Env[Actions, Actions]):
     """One world of a ``SoftEnv`` as a ``gymnasium.Env``; ``reset`` begins the next episode.
 
     Args:
@@ -28,14 +29,12 @@ class SingleEnv(gymnasium.Env[npt.NDArray[np.float32], npt.NDArray[np.float32]])
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[npt.NDArray[np.float32], dict[str, Any]]:
+    ) -> tuple[Actions, dict[str, Any]]:
         super().reset(seed=seed)
         observations, info = self.worlds.reset(seed=seed)
         return observations[0], info
 
-    def step(
-        self, action: npt.NDArray[np.float32]
-    ) -> tuple[npt.NDArray[np.float32], float, bool, bool, dict[str, Any]]:
+    def step(self, action: Actions) -> tuple[Actions, float, bool, bool, dict[str, Any]]:
         observations, reward, terminated, truncated, info = self.worlds.step(np.asarray(action)[None])
         info = {name: each[0].item() for name, each in info.items()}
         return observations[0], float(reward[0]), bool(terminated[0]), bool(truncated[0]), info
@@ -43,3 +42,7 @@ class SingleEnv(gymnasium.Env[npt.NDArray[np.float32], npt.NDArray[np.float32]])
     def render(self) -> npt.NDArray[np.uint8] | None:
         pictures = self.worlds.render()
         return None if pictures is None else pictures[0]
+
+    def scripted_actions(self, observation: Actions) -> Actions:
+        """Actions of the policy by hand."""
+        return self.worlds.scripted_actions(observation[None])[0]

@@ -24,17 +24,19 @@ from warp_corot.contact.grasp import Grasp
 from warp_corot.contact.obstacles import LARGEST_SHARE
 from warp_corot.contact.options import Contact
 from warp_corot.contact.shapes import Shape
+from warp_corot.contact.tool import Obstacle
 from warp_corot.discretization.discretization import centroids
 from warp_corot.elasticity import Corotated
 from warp_corot.errors import InputError, UnstableError
-from warp_corot.inputs.checks import checked_choice, checked_count, checked_device, checked_flag, checked_numbers, shown
+from warp_corot.inputs.checks import checked_choice, checked_count, checked_device, checked_flag, shown
+from warp_corot.io.write.skins import poses_of, shape_of
 from warp_corot.kernels.envs import episodes as kernels
 from warp_corot.materials.isotropic import Isotropic
 from warp_corot.simulation.simulation import Simulation
 from warp_corot.solvers import BackwardEuler, Integrator, SymplecticEuler
 from warp_corot.solvers.recorded import Segment
 
-from .task import Actions, Scene, Task
+from .task import Actions, Scene, Task, checked_ranges, columns_of
 
 #: Actions, observations, rewards and flags as arrays of these.
 ARRAYS = ("numpy", "torch", "warp")
@@ -122,7 +124,7 @@ class SoftEnv(VectorEnv):
         self.cells = checked_count(cells, "cells", least=1)
         self.array, self.render_mode, self.device = array, render_mode, checked_device(device)
         self.metadata = {**self.metadata, "autoreset_mode": AUTORESETS[autoreset]}
-        self.ranges = self._checked_ranges(ranges or {})
+        self.ranges = checked_ranges(self.task.ranges, ranges)
         steps = self.task.steps if max_episode_steps is None else max_episode_steps
         self.max_episode_steps = checked_count(steps, "max_episode_steps", least=1)
         self._threads = threads
@@ -230,9 +232,21 @@ class SoftEnv(VectorEnv):
         """Pictures of the first worlds, at most four, uint8 [height, width, 3] each; None without a render mode."""
         if self.render_mode is None:
             return None
-        from .picture import draw_world
+        from .picture import draw
 
-        return tuple(draw_world(self, world) for world in range(min(self.num_envs, 4)))
+        scene = self.scene
+        tools: list[Obstacle] = [*scene.tools, *scene.obstacles]
+        return tuple(
+            draw(
+                self.sim,
+                scene.mesh,
+                [*zip(map(shape_of, tools), poses_of(tools, world), strict=True), *self.decorations(world)],
+                self.task.window,
+                self.task.view,
+                world,
+            )
+            for world in range(min(self.num_envs, 4))
+        )
 
     def seen(self, observations: Actions, *names: str) -> list[Actions]:
         """Named parts of observations, [n, ...] each."""
@@ -245,7 +259,7 @@ class SoftEnv(VectorEnv):
     @property
     def drawn(self) -> dict[str, npt.NDArray[np.float32]]:
         """The drawn numbers of the present episodes, float32 [worlds] each; waits for the device."""
-        return dict(zip(self.ranges, self.worlds.draws.numpy().T, strict=True))
+        return dict(zip(self.ranges, self.worlds.draws.numpy().T.copy(), strict=True))
 
     @property
     def _steering(self) -> list:
@@ -254,22 +268,6 @@ class SoftEnv(VectorEnv):
         return [self.task.speed / RATE, wp.vec3(*low), wp.vec3(*high)]
 
     # --- pieces ----------------------------------------------------------------------------------------------------
-
-    def _checked_ranges(self, given: Mapping[str, tuple[float, float]]) -> dict[str, tuple[float, float]]:
-        ranges = {name: (float(low), float(high)) for name, (low, high) in self.task.ranges.items()}
-        for name, bounds in given.items():
-            if name not in ranges:
-                raise InputError(f"there is no range {shown(name)}; there are {', '.join(ranges)}")
-            pair = checked_numbers(bounds, name, "[2]")
-            if (
-                pair.shape != (2,)
-                or not np.isfinite(pair).all()
-                or pair[0] > pair[1]
-                or (name == "young" and pair[0] <= 0)
-            ):
-                raise InputError(f"the range {name} is {bounds}; it must be a lowest and a highest number")
-            ranges[name] = float(pair[0]), float(pair[1])
-        return ranges
 
     def _make_simulation(self, integrator: str) -> None:
         """Make the simulation; time steps and the law of contact are those of a single world, so that they do not
@@ -312,11 +310,10 @@ class SoftEnv(VectorEnv):
         count, scene, device, task = self.num_envs, self.scene, self.device, self.task
         sizes = {f"tool{k}.{name}": 3 for k in range(len(scene.tools)) for name in TOOL_PARTS}
         sizes |= {"points": 3 * len(scene.points), "time": 1, **task.notes}
-        ends = np.cumsum(list(sizes.values())).tolist()
-        self.columns = {name: slice(end - size, end) for (name, size), end in zip(sizes.items(), ends, strict=True)}
+        self.columns = columns_of(sizes)
         worlds = self.worlds = kernels.Worlds()
         shapes = {"draws": (count, len(self.ranges)), "actions": (count, task.actions)}
-        shapes |= {"observations": (count, ends[-1]), "notes": (count, sum(task.notes.values()))}
+        shapes |= {"observations": (count, sum(sizes.values())), "notes": (count, sum(task.notes.values()))}
         kinds: dict[str, Any] = {name: wp.float32 for name in ("peak", "reward", "young", "ratio", *shapes)}
         kinds |= dict.fromkeys(("seed", "number", "step", "streak", "over", "again", "lost", "closed"), wp.int32)
         kinds |= dict.fromkeys(("terminated", "truncated", "success"), wp.bool)

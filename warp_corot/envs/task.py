@@ -13,6 +13,8 @@ import warp as wp
 from warp_corot.body.controls import Nodes
 from warp_corot.contact.shapes import Shape, Vector
 from warp_corot.contact.tool import Tool
+from warp_corot.errors import InputError
+from warp_corot.inputs.checks import checked_numbers, shown
 from warp_corot.mesh.forest import TetForest
 from warp_corot.mesh.tetmesh import TetMesh
 
@@ -82,6 +84,31 @@ class Task:
     notes: Mapping[str, int] = field(default_factory=dict)
     steps: int = 200
     feels_stress: bool = False
+
+
+def checked_ranges(
+    declared: Mapping[str, tuple[float, float]], given: Mapping[str, tuple[float, float]] | None
+) -> dict[str, tuple[float, float]]:
+    """Declared ranges with given ones in their place.
+
+    Raises:
+        InputError: A given range has no such name or is none.
+    """
+    ranges = {name: (float(low), float(high)) for name, (low, high) in declared.items()}
+    for name, bounds in (given or {}).items():
+        if name not in ranges:
+            raise InputError(f"there is no range {shown(name)}; there are {', '.join(ranges)}")
+        pair = checked_numbers(bounds, name, "[2]")
+        if pair.shape != (2,) or not np.isfinite(pair).all() or pair[0] > pair[1] or (name == "young" and pair[0] <= 0):
+            raise InputError(f"the range {name} is {bounds}; it must be a lowest and a highest number")
+        ranges[name] = float(pair[0]), float(pair[1])
+    return ranges
+
+
+def columns_of(sizes: Mapping[str, int]) -> dict[str, slice]:
+    """The place of each named part among numbers in a row."""
+    ends = np.cumsum(list(sizes.values())).tolist()
+    return {name: slice(end - size, end) for (name, size), end in zip(sizes.items(), ends, strict=True)}
 
 
 def symmetric(**largest: float) -> dict[str, tuple[float, float]]:

@@ -21,8 +21,8 @@ class Retract(SoftEnv):
     Observed points: the middle and the two corners of the rim.
     """
 
-    #: Edges of the flap, and the radius of the gripper [m].
-    FLAP, RADIUS = (0.072, 0.048, 0.008), 0.004
+    #: Edges of the flap, and the radius of the gripper and how far it takes hold [m].
+    FLAP, RADIUS, REACH = (0.072, 0.048, 0.008), 0.004, 0.009
     task = Task(
         ranges={
             "young": (5e3, 2e4),
@@ -32,7 +32,7 @@ class Retract(SoftEnv):
         begin=tasks.begin_retraction,
         begun=(wp.vec3(FLAP[0], 0.5 * FLAP[1], FLAP[2]),),
         judge=tasks.judge_retraction,
-        judged=(0.005, 10, 10.0),
+        judged=(0.005, REACH, 10, 10.0),
         actions=4,
         speed=0.1,
         workspace=((-0.02, -0.03, 0.002), (0.11, 0.08, 0.09)),
@@ -47,7 +47,8 @@ class Retract(SoftEnv):
         points = nodes_at(mesh, [(x, 0.5 * y, z), (x, 0.0, z), (x, y, z)])
         gripper = Tool(Sphere(self.RADIUS, position=(x, 0.5 * y, 0.03)), speed=2.0 * self.task.speed)
         rim = mesh.points[:, 0] > x - 1e-6
-        return Scene(mesh, "x == xmin", [gripper], [Ground()], points, (0.0, 0.5 * y, 0.0), gripped=rim, reach=0.009)
+        centre = (0.0, 0.5 * y, 0.0)
+        return Scene(mesh, "x == xmin", [gripper], [Ground()], points, centre, gripped=rim, reach=self.REACH)
 
     def scripted_actions(self, observations: Actions) -> Actions:
         gripper, goal, points, closed = self.seen(observations, "tool0.position", "goal", "points", "closed")
