@@ -296,8 +296,8 @@ def test_an_organ_without_flat_feet_lies_on_a_ground(folder, capsys):
     assert points[1][:, 2].max() < points[0][:, 2].max() - 1e-3
     held = (["--no-ground"], ["--fix", "bottom"], ["--pull", "top", 0, 0, "1mm"], ["--static"], ["--gravity", 0, 0, 0])
     for option in held:
-        assert simulate("organ.stl", *asked, *option) == 0
+        assert simulate("organ.stl", *asked, "--duration", 0.1, *option) == 0
         assert "ground" not in "".join(capsys.readouterr()).replace("--no-ground", "")
-    assert simulate("drum.stl", *asked) == 0
+    assert simulate("drum.stl", *asked, "--duration", 0.1) == 0
     assert "the body stands on its lowest 10 %" in capsys.readouterr().err
     assert_refused(folder, capsys, "--no-ground is given with --ground", "drum.stl", "--no-ground", "--ground", *asked)
