@@ -9,7 +9,7 @@ import pytest
 from pxr import Usd, UsdGeom
 
 #: Options that make an example short enough for a test.
-SHORT = {"sweep": ["--beams", "8"]} | dict.fromkeys(("remesh", "cut_organ", "resume"), ["--duration", "0.25"])
+SHORT = {"sweep": ["--beams", "8"]} | {key: ["--duration", "0.25"] for key in ("remesh", "cut_organ", "resume")}
 #: Large packages that examples need and the tests do not install.
 NEEDS = {
     "brain": "nilearn",
