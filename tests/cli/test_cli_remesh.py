@@ -1,14 +1,12 @@
 """``warp-corot simulate --remesh``: its messages, its files and its errors."""
 
-import csv
 import os
 import re
-from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
-from command_line import SHORT, assert_refused, simulate
+from command_line import SHORT, assert_refused, simulate, table
 from input_files import write_vtk
 from pxr import UsdGeom
 from stages import assert_whole, opened
@@ -57,12 +55,6 @@ def test_it_simulates_the_same_as_the_library(folder):
 def test_a_given_step_stays(folder, capsys):
     assert simulate("box", "-o", "a.usd", *BENT, "--dt", 1e-4, "--duration", 0.1, "--fps", 10) == 0
     assert re.search(r"time step +0\.1 ms", capsys.readouterr().out)
-
-
-def table(path) -> dict[str, np.ndarray]:
-    with Path(path).open() as file:
-        header, *rows = csv.reader(file)
-    return dict(zip(header, np.array(rows, float).T, strict=True))
 
 
 def test_a_pressure_stays_the_same_while_the_mesh_changes(folder, capsys):

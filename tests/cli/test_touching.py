@@ -1,13 +1,12 @@
 """Ground, drops and tools of the command line: forces in the table, prims in the stage, pictures, run files."""
 
-import csv
 import tomllib
 from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
-from command_line import SHORT, assert_refused, simulate
+from command_line import SHORT, assert_refused, simulate, table
 from input_files import write_vtk
 from PIL import Image
 from pxr import Usd, UsdGeom, UsdValidation
@@ -26,12 +25,6 @@ WEIGHT = 9.81 * 1000 * 0.04 * 0.04 * 0.02
 def block(folder) -> Path:
     write_vtk(folder / "block.vtk", BLOCK.points, BLOCK.tets)
     return folder / "block.vtk"
-
-
-def table(path) -> dict[str, np.ndarray]:
-    with Path(path).open() as file:
-        header, *rows = csv.reader(file)
-    return dict(zip(header, np.array(rows, float).T, strict=True))
 
 
 def write_path(folder: Path, text: str) -> Path:
