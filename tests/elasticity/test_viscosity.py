@@ -177,7 +177,11 @@ def test_viscosity_must_be_a_time(value):
 MIXED = wc.TetForest.box((1, 1, 2), 0.1, 4).refine(np.arange(0, 100, 7))
 
 
-@pytest.mark.parametrize("mesh", [MIXED, wc.TetMesh(MIXED.points, MIXED.tets)], ids=["forest", "general"])
+@pytest.mark.parametrize(
+    "mesh",
+    [MIXED, pytest.param(wc.TetMesh(MIXED.points, MIXED.tets), marks=pytest.mark.slow)],
+    ids=["forest", "general"],
+)
 @pytest.mark.parametrize("amount", [0.0, 0.05, 3.0])
 def test_elements_side_by_side_do_what_each_does_alone(mesh, amount, rng):
     """Of all types, each with its own material, strained until some are turned inside out."""

@@ -63,7 +63,7 @@ def test_own_rotations_by_subtrees(amount, device, rng):
 
 
 @pytest.mark.parametrize("amount", AMOUNTS)
-@pytest.mark.parametrize("leaf_level", [6, 7, 8])
+@pytest.mark.parametrize("leaf_level", [6, *(pytest.param(level, marks=pytest.mark.slow) for level in (7, 8))])
 def test_shared_rotations_by_subtrees(leaf_level, amount, device, rng):
     """Displacements rotated back by the root's rotation keep their digits at every size."""
     forest = wc.TetForest.box((1, 1, 1), 0.1, leaf_level)
