@@ -195,7 +195,7 @@ FIBRES = wc.FibreReinforced(1e4, 0.3, 5e3, 5.0, direction=(0.2, 0.1, 1.0), densi
     [
         ("activation", MUSCLE, wc.Corotated()),
         pytest.param("rest", MUSCLE, wc.Corotated(), marks=pytest.mark.slow),
-        pytest.param("rest", FIBRES, wc.HolzapfelGasserOgden(), marks=pytest.mark.slow),
+        ("rest", FIBRES, wc.HolzapfelGasserOgden()),
     ],
 )
 def test_active_stress(name, muscle, model, device):
