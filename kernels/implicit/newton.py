@@ -289,8 +289,7 @@ def judge_step(
 @wp.kernel(enable_backward=False)
 def judge_only(
     # In
-    parts: wp.array3d[wp.float64],
-    lanes: int,
+    sums: Sums,
     inertia: wp.array[wp.float32],
     # In and out
     scalars: wp.array2d[wp.float64],
@@ -299,12 +298,12 @@ def judge_only(
 ):
     """Stop worlds whose whole step does not go far beyond the end of the descent, and let the others begin again.
 
-    r . step after the step is that of elastic forces, which the first column of parts has, and of a polynomial; it is
+    r . step after the step is that of elastic forces, which the first column of sums has, and of a polynomial; it is
     zero where the derivative is right. What is not finite is left to the run, which goes back.
     """
     world, lane = wp.tid()
-    after = add_up(parts, world, lane, lanes, SLOPE) + add_up(parts, world, lane, lanes, OUTER)
-    after -= wp.float64(inertia[0]) * add_up(parts, world, lane, lanes, INERTIA)
+    after = add_up(sums, world, lane, SLOPE) + add_up(sums, world, lane, OUTER)
+    after -= wp.float64(inertia[0]) * add_up(sums, world, lane, INERTIA)
     if lane == 0 and status[world] == RUNNING:
         if not is_number(after) or after >= -BEYOND * scalars[world, SLOPE_NOW]:
             stop(status, running, world, CONVERGED)

@@ -58,7 +58,9 @@ def test_options_reach_the_simulation(folder, capsys):
     assert "0 0 -10 m/s^2, damping 1 /s" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("model", CHOICES)
+@pytest.mark.parametrize(
+    "model", [pytest.param(model, marks=pytest.mark.slow) if model == "ogden" else model for model in CHOICES]
+)
 def test_every_model(folder, model, capsys):
     assert simulate("box", "-o", "a.usd", "--model", model, *SHORT) == 0
     assert re.search(rf"model +{model}[,\n]", capsys.readouterr().out)

@@ -89,7 +89,7 @@ def test_units_and_factors_of_every_input(folder, capsys):
     write_gmsh(folder / "tet.msh", 100 * np.eye(4, 3, k=-1), [(4, 1, [0, 1, 2, 3])])
     write_scan(folder / "scan.nii", unit="unknown")
     for name, size in (("organ.obj", "60 mm x 80 mm x 100 mm"), ("scan.nii", "80 mm x 80 mm x 80 mm")):
-        for args, factor in (([], 1), (["--unit", "2mm"], 2), (["--scale", 3, "--unit", "mm"], 3)):
+        for args, factor in (([], 1), (["--scale", 3, "--unit", "2mm"], 6)):
             assert simulate(name, "-o", "a.usd", "--tets", 300, *args, *SHORT) == 0
             out, err = capsys.readouterr()
             notes = [line for line in err.splitlines() if "compiling" not in line]

@@ -1,13 +1,12 @@
 """Ground, drops and tools of the command line: forces in the table, prims in the stage, pictures, run files."""
 
-import csv
 import tomllib
 from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
-from command_line import SHORT, assert_refused, simulate
+from command_line import SHORT, assert_refused, simulate, table
 from input_files import write_vtk
 from PIL import Image
 from pxr import Usd, UsdGeom, UsdValidation
@@ -26,12 +25,6 @@ WEIGHT = 9.81 * 1000 * 0.04 * 0.04 * 0.02
 def block(folder) -> Path:
     write_vtk(folder / "block.vtk", BLOCK.points, BLOCK.tets)
     return folder / "block.vtk"
-
-
-def table(path) -> dict[str, np.ndarray]:
-    with Path(path).open() as file:
-        header, *rows = csv.reader(file)
-    return dict(zip(header, np.array(rows, float).T, strict=True))
 
 
 def write_path(folder: Path, text: str) -> Path:
@@ -296,8 +289,8 @@ def test_an_organ_without_flat_feet_lies_on_a_ground(folder, capsys):
     assert points[1][:, 2].max() < points[0][:, 2].max() - 1e-3
     held = (["--no-ground"], ["--fix", "bottom"], ["--pull", "top", 0, 0, "1mm"], ["--static"], ["--gravity", 0, 0, 0])
     for option in held:
-        assert simulate("organ.stl", *asked, *option) == 0
+        assert simulate("organ.stl", *asked, "--duration", 0.1, *option) == 0
         assert "ground" not in "".join(capsys.readouterr()).replace("--no-ground", "")
-    assert simulate("drum.stl", *asked) == 0
+    assert simulate("drum.stl", *asked, "--duration", 0.1) == 0
     assert "the body stands on its lowest 10 %" in capsys.readouterr().err
     assert_refused(folder, capsys, "--no-ground is given with --ground", "drum.stl", "--no-ground", "--ground", *asked)

@@ -156,7 +156,9 @@ def test_a_blade_is_moved_by_hand(device):
     assert body.pieces == 2
 
 
-@pytest.mark.parametrize("way", ["follow", "move", "use_poses"])
+@pytest.mark.parametrize(
+    "way", [*(pytest.param(way, marks=pytest.mark.slow) for way in ("follow", "move")), "use_poses"]
+)
 def test_a_handle_and_an_edge_are_one_scalpel(way, device):
     """A tool and a blade that are given the same motion: the edge cuts, and the handle presses what it meets."""
     body = block(device, toughness=0.5)

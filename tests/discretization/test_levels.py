@@ -9,8 +9,6 @@ from volumes import blobs
 
 import warp_corot as wc
 
-ROUNDING = np.finfo(np.float32).eps
-
 
 def uniform():
     return wc.TetForest.box((2, 1, 1), 0.1, 7)

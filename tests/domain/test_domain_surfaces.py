@@ -56,14 +56,6 @@ def test_disorder_makes_no_difference(device, rng):
     same(Domain.from_surface((points, np.concatenate([triangles, triangles[:, ::-1]])), device=device), right, rng)
 
 
-def test_many_triangles_wound_in_disorder(rng):
-    points, triangles = arrays(trimesh.creation.icosphere(6))
-    disordered = np.where((rng.random(len(triangles)) < 0.3)[:, None], triangles[:, ::-1], triangles)
-    closed = close_surface(points, disordered)
-    assert closed.volume == pytest.approx(close_surface(points, triangles).volume, rel=1e-12)
-    assert np.array_equal(closed.was_inwards, disordered[:, 0] != triangles[:, 0])
-
-
 @pytest.mark.parametrize("copies", ["alike", "both ways round", "nearly in place"])
 def test_triangles_that_are_there_twice_make_no_holes(copies, device, rng):
     points, triangles = arrays(trimesh.creation.icosphere(2))

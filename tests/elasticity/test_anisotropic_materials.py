@@ -89,33 +89,6 @@ def test_worlds_of_different_materials(name, device, rng):
     assert sim.energy().elastic == pytest.approx(energy, rel=1e-5)
 
 
-@pytest.mark.parametrize("name", ["mixed levels", "general"])
-def test_deterministic_runs(name, device, rng):
-    mesh = MESHES[name]()
-    material = wood(random_axes(rng, len(mesh.tets)))
-    u = random_displacement(mesh, rng, 0.5)
-    ends = []
-    for _ in range(2):
-        sim, body = simulated(mesh, material, device, deterministic=True)
-        place(body, u)
-        sim.advance_steps(100)
-        ends.append(body.displacements.numpy())
-    np.testing.assert_array_equal(*ends)
-
-
-def test_a_resumed_run_is_the_uninterrupted_one(tmp_path, device, rng):
-    mesh = MESHES["general"]()
-    for material in (muscle(rng.standard_normal((len(mesh.tets), 3))), wood(random_axes(rng))):
-        sim, body = simulated(mesh, material, device, deterministic=True)
-        place(body, random_displacement(mesh, rng, 0.1))
-        sim.advance_steps(10)
-        sim.save(tmp_path / "state.npz")
-        resumed = wc.Simulation.load(tmp_path / "state.npz")
-        for run in (sim, resumed):
-            run.advance_steps(30)
-        np.testing.assert_array_equal(body.displacements.numpy(), resumed.body.displacements.numpy())
-
-
 def test_recorded_with_the_nearest_isotropic_material(tmp_path, device):
     from pxr import Usd
 

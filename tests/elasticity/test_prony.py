@@ -207,7 +207,7 @@ def test_elements_carry_their_history_where_the_mesh_changes(device, tmp_path):
     assert tips["coarse"][1] > tips["remeshed"][1] > tips["fine"][1]
 
 
-@pytest.mark.parametrize("is_general", [False, True])
+@pytest.mark.parametrize("is_general", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_elements_side_by_side_do_what_each_does_alone(is_general, rng):
     """Forces and relaxation of elements of all types, each with its own material and history."""
     forest = mixed_forest()

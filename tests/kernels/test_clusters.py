@@ -29,7 +29,11 @@ from warp_corot.kernels.elements.simd8 import law_kernel
 from warp_corot.kernels.tables.cluster_layout import BANK_GROUPS, QUAD_BYTES, ClusterLayout
 
 MU, LAM = 900.0, 4000.0
-LAYOUTS = [ClusterLayout(), ClusterLayout(threads=64, each=2), ClusterLayout(threads=64)]
+LAYOUTS = [
+    ClusterLayout(),
+    ClusterLayout(threads=64, each=2),
+    pytest.param(ClusterLayout(threads=64), marks=pytest.mark.slow),
+]
 
 
 @law_kernel()

@@ -152,18 +152,6 @@ def test_empty(device):
     assert wc.polar_rotation(np.zeros((0, 3, 3), np.float32), device=device).shape == (0, 3, 3)
 
 
-@pytest.mark.parametrize("method", METHODS)
-def test_methods_agree_in_the_force(method, device, rng):
-    mesh = mixed_forest()
-    sim, body = simulation(mesh, wc.Corotated(rotation=method), device)
-    u = random_displacement(mesh, rng, 0.1)
-    place(body, u)
-    reference = oracle_mesh(mesh)
-    lame = oracle.lame(MATERIAL["young"], MATERIAL["poisson"])
-    _, expected = oracle.evaluate("corotated", reference, mesh.points + u.astype(float), *lame)
-    assert np.abs(sim.forces().numpy() - expected).max() < 1e-5 * np.abs(expected).max()
-
-
 # --- rotations of tree levels -----------------------------------------------------------------------------------------
 
 

@@ -97,13 +97,6 @@ def test_refined_leaves_are_those_of_the_sequential_bisection(seed):
     assert len(set(forest.levels)) > 2
 
 
-def test_refining_every_leaf_is_the_next_level():
-    forest = wc.TetForest.box((1, 2, 1), CUBE, 3)
-    everything = forest.refine(np.ones(len(forest.tets), bool))
-    assert set(leaf_set(everything)) == set(leaf_set(wc.TetForest.box((1, 2, 1), CUBE, 4)))
-    assert np.array_equal(forest.refine(np.zeros(len(forest.tets), bool)).tets, forest.tets)
-
-
 def test_refining_one_corner_deeply_stays_conforming():
     """The leaf at one corner bisected thirty times: levels from 0 to 30 side by side in a small forest."""
     forest = wc.TetForest.box((2, 2, 1), CUBE, 0)
@@ -115,17 +108,6 @@ def test_refining_one_corner_deeply_stays_conforming():
     assert len(forest.tets) < 3000
     assert_conforming(forest)
     assert oracle.Mesh(forest.points, forest.tets).volumes.sum() == pytest.approx(4 * CUBE**3)
-
-
-@pytest.mark.parametrize("level", range(7))
-def test_uniform_levels_are_conforming(level):
-    assert_conforming(wc.TetForest.box((2, 1, 2), CUBE, level))
-
-
-@pytest.mark.parametrize("seed", range(4))
-def test_mixed_levels_are_conforming(seed):
-    forest = mixed_forest(seed=seed, cells=(2, 1, 1), level=1, passes=5)
-    assert_conforming(forest)
 
 
 @pytest.mark.parametrize("level", range(10))

@@ -4,9 +4,7 @@ import argparse
 import importlib.util
 import json
 import math
-import os
 import runpy
-import subprocess
 import sys
 from pathlib import Path
 from types import SimpleNamespace
@@ -49,15 +47,6 @@ def run(benchmarks, monkeypatch, capsys):
         return SimpleNamespace(returncode=ended.value.code or 0, stdout=said.out, stderr=said.err)
 
     return run
-
-
-def run_apart(script, *arguments, path):
-    """Run a script as users do, in a process where the folder ``path`` comes before installed packages."""
-    paths = filter(None, [str(path), os.environ.get("PYTHONPATH")])
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join(paths)}
-    command = [sys.executable, str(BENCHMARKS / script), *map(str, arguments)]
-    here = Path(__file__).parent
-    return subprocess.run(command, capture_output=True, encoding="utf-8", env=environment, cwd=here)
 
 
 def report(done, path):
@@ -121,28 +110,6 @@ def test_the_history_takes_runs_and_its_page_is_up_to_date(run, tmp_path):
         assert done.stderr.startswith("history.py: error: ")
         assert done.stderr.count("\n") == 1
         assert (tmp_path / "history.jsonl").read_text(encoding="utf-8") == kept
-
-
-@pytest.mark.slow
-def test_peers_that_are_not_there_are_left_out(device, tmp_path):
-    for name in ("newton", "mujoco"):
-        (tmp_path / f"{name}.py").write_text(f"raise ImportError('no {name} here')\n")
-    path = tmp_path / "peers.json"
-    arguments = ["--device", device, "--level", 3, "--step-level", 3, "--rounds", 1, "--json", path]
-    done = run_apart("peers.py", *arguments, path=tmp_path)
-    found = report(done, path)
-    assert "newton: left out (no newton here)" in done.stdout
-    assert "mujoco: left out (no mujoco here)" in done.stdout
-    assert found["peers"] == {}
-    firsts = {}
-    for row in found["rows"]:
-        first = firsts.setdefault(row["stage"], row)
-        assert row["times_ours"] == pytest.approx(row["ns_per_tet"] / first["ns_per_tet"])
-        assert row["error"] <= 1e-3
-        if row["stage"] == "whole step":
-            assert 0 < row["dt"] < row["largest_dt"] <= 1 / 60
-            assert row["simulated_s_per_s"] == pytest.approx(row["largest_dt"] / (row["ns_per_tet"] * 48e-9))
-    assert {"rotation", "whole force", "whole step"} == set(firsts)
 
 
 @pytest.mark.slow

@@ -9,7 +9,7 @@ import pytest
 from pxr import Usd, UsdGeom
 
 #: Options that make an example short enough for a test.
-SHORT = {"sweep": ["--beams", "8"]}
+SHORT = {"sweep": ["--beams", "8"]} | {key: ["--duration", "0.25"] for key in ("remesh", "cut_organ", "resume")}
 #: Large packages that examples need and the tests do not install.
 NEEDS = {
     "brain": "nilearn",
@@ -26,7 +26,7 @@ def test_example(script, device, tmp_path, monkeypatch, capsys):
     if script.stem in NEEDS:
         pytest.importorskip(NEEDS[script.stem])
     output = tmp_path / "out.usd"
-    options = ["--device", device, "-o", str(output), "--duration", "0.25", *SHORT.get(script.stem, [])]
+    options = ["--device", device, "-o", str(output), "--duration", "0.13", *SHORT.get(script.stem, [])]
     monkeypatch.setattr(sys, "argv", [str(script), *options])
     runpy.run_path(str(script), run_name="__main__")
     said = capsys.readouterr().out

@@ -138,7 +138,7 @@ def test_mass_of_two_densities_is_that_of_their_layers(device):
 
 
 @pytest.mark.parametrize("sliver", [0.02, 0.0])
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_no_node_is_left_without_stiffness(seed, sliver, device):
     """For any cut: the stable step is that of whole elements within 10 %, and the lightest nodes
     vibrate as fast as in whole elements: stiffness scales with mass."""

@@ -19,11 +19,10 @@ for module in (wc, elements):
     assert pathlib.Path(module.__file__).is_relative_to({site!r}), module.__file__
 mesh = wc.TetForest.box(level=2)
 body = wc.SoftBody(mesh, wc.Isotropic(1e4, 0.3, 1000.0), device="cpu")
-body.fix(mesh.points[:, 0] == 0)
-sim = wc.Simulation(body)
-sim.advance_steps(3)
-assert np.isfinite(body.positions.numpy()).all()
-print("stepped", sim.steps)
+body.displacements = 0.1 * mesh.points
+forces = wc.NeoHookean().bind(body).elastic_forces(body.state.displacements).numpy()
+assert np.isfinite(forces).all()
+print("forces", np.abs(forces).max() > 0.0)
 """
 
 
@@ -78,7 +77,7 @@ def test_the_installed_command_and_package_work_from_another_folder(built, tmp_p
     assert run(tmp_path, command, "--version", path=site).split()[1] == PROJECT["version"]
     script = tmp_path / "script.py"
     script.write_text(SCRIPT.format(site=str(site)))
-    assert run(tmp_path, script, path=site).splitlines()[-1] == "stepped 3"
+    assert run(tmp_path, script, path=site).splitlines()[-1] == "forces True"
 
 
 def built_name() -> str:

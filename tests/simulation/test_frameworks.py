@@ -123,29 +123,6 @@ class TestJax:
         with jax.default_device(where):
             yield jax
 
-    def test_node_positions_are_a_jax_array(self, jax, device):
-        """All four numbers of each node are contiguous; a view of three is not."""
-        sim = bar(device, gravity=(0.0, -9.81, 0.0))
-        x = wp.to_jax(sim.body.node_positions)
-        assert x.shape == (sim.body.node_count, 4)
-        assert x.unsafe_buffer_pointer() == sim.body.node_positions.ptr
-        sim.step()
-        np.testing.assert_array_equal(np.asarray(wp.to_jax(sim.body.node_positions))[:, :3], sim.body.positions.numpy())
-
-    @pytest.mark.parametrize("width", [3, 4])
-    def test_arrays_of_jax_are_the_loads(self, jax, width, device, rng):
-        """JAX makes a new array each time; it is read in place."""
-        sim = bar(device)
-        doubled = jax.jit(lambda forces: 2.0 * forces)
-        given = some_forces(rng)
-        for each in given:
-            forces = doubled(np.pad(0.5 * each, ((0, 0), (0, width - 3)))).block_until_ready()
-            sim.body.use_loads(wp.from_jax(forces))
-            assert sim.body.loads.ptr == forces.unsafe_buffer_pointer()
-            for _ in range(5):
-                sim.step()
-        np.testing.assert_array_equal(sim.body.positions.numpy(), ordinary(device, given, 5))
-
     @pytest.mark.parametrize("mode", ["JAX", "WARP", "NONE"])
     def test_steps_are_an_operation_of_a_compiled_function(self, jax, mode, device, rng):
         """Inside ``jit`` and ``scan``, with JAX's buffers, on its stream and in its graph."""

@@ -158,29 +158,6 @@ def test_runs_of_worlds_and_of_several_bodies_repeat(device):
     assert_repeats(make)
 
 
-def test_a_world_that_is_reset_repeats_bit_by_bit(device):
-    for mesh in (uniform(5), adaptive()):
-        # Given: a step that follows the state depends on the other worlds, too.
-        dt = 0.5 * simulated(body_on(device, mesh, worlds=3)).stable_dt
-        sim = simulated(body_on(device, mesh, worlds=3), dt=dt, deterministic=True)
-        sim.advance_steps(100)
-        first = sim.body.world(1).displacements.numpy()
-        sim.advance_steps(30)
-        sim.reset([1])
-        sim.advance_steps(100)
-        np.testing.assert_array_equal(sim.body.world(1).displacements.numpy(), first)
-
-
-def test_a_resumed_run_is_the_uninterrupted_one_bit_by_bit(device, tmp_path):
-    whole, parted = (simulated(body_on(device, adaptive(), worlds=2), deterministic=True) for _ in range(2))
-    whole.advance_steps(130)
-    parted.advance_steps(70)
-    parted.save(tmp_path / "state.npz")
-    resumed = wc.Simulation.load(tmp_path / "state.npz")
-    resumed.advance_steps(60)
-    np.testing.assert_array_equal(state(resumed), state(whole))
-
-
 @pytest.mark.parametrize(("mesh", "model"), CASES, ids=repr)
 @pytest.mark.parametrize("amount", [0.1, 0.9])
 def test_sums_in_one_order_give_the_same_forces(mesh, model, amount, device):

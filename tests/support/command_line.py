@@ -1,7 +1,9 @@
 """The command line as tests call it."""
 
+import csv
 from pathlib import Path
 
+import numpy as np
 import warp as wp
 
 from warp_corot.cli import main
@@ -39,3 +41,10 @@ def assert_refused(folder: Path, capsys, said: str, *args: object) -> None:
     assert error.startswith("warp-corot: error: ")
     assert said in error
     assert {file.name: file.read_bytes() for file in folder.iterdir()} == before
+
+
+def table(path: str | Path) -> dict[str, np.ndarray]:
+    """The columns of a table that --csv wrote, by name."""
+    with Path(path).open() as file:
+        header, *rows = csv.reader(file)
+    return dict(zip(header, np.array(rows, float).T, strict=True))

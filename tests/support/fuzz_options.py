@@ -18,7 +18,7 @@ NAME=z<0 a=bottom a=a b=nearest(0,0,0,9) 0,0,0 5kPa:0.45 5kPa:0.6 5kPa:0.45:1000
 ball(0,0,0,1) box(0,0,0,1,1,1) nearest(0,0,0,5)"""
 WORDS = [*_WORDS.split(), "", "z < 0", "z <", "0 0 0", "0.01 0 0", "not x", "\u00e4", LONG_WORD, "x > 0 and y > 0"]
 #: Files that lists name: they must exist.
-FILES = ("ply", "nii", "vtk", "usda", "run")
+FILES = ("ply", "nii", "vtk-4", "usda", "run")
 INPUTS = ["box", "run.toml", "none.stl", "none.toml", "warp:nobody", ""]
 INPUTS += ["seed.ply", "seed.nii", "seed.vtk", "seed.usda"]
 

@@ -199,34 +199,9 @@ def _pvtu(folder: Path) -> Path:
     return folder / "seed.pvtu"
 
 
-def _lattice(suffix: str) -> Callable[[Path], Path]:
-    """A structured or a rectilinear grid."""
-
-    def make(folder: Path) -> Path:
-        from foreign_meshes import write_with_vtk
-        from vtkmodules.util.numpy_support import numpy_to_vtk
-        from vtkmodules.vtkCommonCore import vtkPoints
-        from vtkmodules.vtkCommonDataModel import vtkRectilinearGrid, vtkStructuredGrid
-
-        if suffix == ".vtr":
-            data = vtkRectilinearGrid()
-            data.SetDimensions(3, 3, 3)
-            for axis in "XYZ":
-                getattr(data, f"Set{axis}Coordinates")(numpy_to_vtk(np.linspace(0.0, 0.1, 3), deep=True))
-        else:
-            data, places = vtkStructuredGrid(), vtkPoints()
-            data.SetDimensions(3, 3, 3)
-            for place in np.ndindex(3, 3, 3):
-                places.InsertNextPoint(*(0.05 * np.array(place[::-1])))
-            data.SetPoints(places)
-        return write_with_vtk(folder / f"seed{suffix}", data)
-
-    return make
-
-
 def _stage(suffix: str, tets: bool = False) -> Callable[[Path], Path]:
     def make(folder: Path) -> Path:
-        from pxr import Usd, UsdGeom, UsdUtils
+        from pxr import Usd, UsdGeom
 
         stage = Usd.Stage.CreateInMemory()
         if tets:
@@ -243,13 +218,8 @@ def _stage(suffix: str, tets: bool = False) -> Callable[[Path], Path]:
             mesh.CreatePointsAttr([tuple(p) for p in ball.vertices.tolist()])
             mesh.CreateFaceVertexCountsAttr([3] * len(ball.faces))
             mesh.CreateFaceVertexIndicesAttr(ball.faces.ravel().tolist())
-        if suffix != ".usdz":
-            stage.Export(str(folder / f"seed{suffix}"))
-            return folder / f"seed{suffix}"
-        stage.Export(str(folder / "inside.usdc"))
-        assert UsdUtils.CreateNewUsdzPackage(str(folder / "inside.usdc"), str(folder / "seed.usdz"))
-        (folder / "inside.usdc").unlink()
-        return folder / "seed.usdz"
+        stage.Export(str(folder / f"seed{suffix}"))
+        return folder / f"seed{suffix}"
 
     return make
 
@@ -281,13 +251,13 @@ def _nibabel(suffix: str) -> Callable[[Path], Path]:
     return make
 
 
-def _itk(suffix: str, compress: bool = False) -> Callable[[Path], Path]:
+def _itk(suffix: str) -> Callable[[Path], Path]:
     def make(folder: Path) -> Path:
         import SimpleITK
 
         image = SimpleITK.GetImageFromArray(_voxels())
         image.SetSpacing((4.0, 4.0, 4.0))
-        SimpleITK.WriteImage(image, str(folder / f"seed{suffix}"), compress)
+        SimpleITK.WriteImage(image, str(folder / f"seed{suffix}"))
         return folder / f"seed{suffix}"
 
     return make
@@ -313,26 +283,20 @@ def _dicom(folder: Path) -> Path:
     return folder / "series"
 
 
-def _vtk_image(suffix: str) -> Callable[[Path], Path]:
-    def make(folder: Path) -> Path:
-        from foreign_meshes import write_with_vtk
-        from vtkmodules.util.numpy_support import numpy_to_vtk
-        from vtkmodules.vtkCommonDataModel import vtkImageData
-        from vtkmodules.vtkIOXML import vtkXMLImageDataWriter
+def _vti(folder: Path) -> Path:
+    from vtkmodules.util.numpy_support import numpy_to_vtk
+    from vtkmodules.vtkCommonDataModel import vtkImageData
+    from vtkmodules.vtkIOXML import vtkXMLImageDataWriter
 
-        grid = vtkImageData()
-        grid.SetDimensions(10, 10, 10)
-        grid.SetSpacing(4.0, 4.0, 4.0)
-        grid.GetPointData().SetScalars(numpy_to_vtk(_voxels().ravel(order="F"), deep=True))
-        if suffix == ".vtk":
-            return write_with_vtk(folder / "seed.vtk", grid)
-        writer = vtkXMLImageDataWriter()
-        writer.SetFileName(str(folder / "seed.vti"))
-        writer.SetInputData(grid)
-        writer.Write()
-        return folder / "seed.vti"
-
-    return make
+    grid = vtkImageData()
+    grid.SetDimensions(10, 10, 10)
+    grid.SetSpacing(4.0, 4.0, 4.0)
+    grid.GetPointData().SetScalars(numpy_to_vtk(_voxels().ravel(order="F"), deep=True))
+    writer = vtkXMLImageDataWriter()
+    writer.SetFileName(str(folder / "seed.vti"))
+    writer.SetInputData(grid)
+    writer.Write()
+    return folder / "seed.vti"
 
 
 def _run(folder: Path) -> Path:
@@ -357,21 +321,15 @@ def _checkpoint(remeshed: bool) -> Callable[[Path], Path]:
 #: Functions that write a valid input into an empty folder, by format. A new format is one line.
 SEEDS: dict[str, Callable[[Path], Path]] = {
     "stl": _ball(".stl"),
-    "stl-text": _ball(".stl", 0, file_type="stl_ascii"),
     "obj": _objects,
     "ply": _ball(".ply"),
-    "ply-text": _ball(".ply", encoding="ascii"),
-    "off": _ball(".off"),
     "glb": _ball(".glb"),
     "gltf": _gltf,
     "usda": _stage(".usda"),
     "usdc": _stage(".usdc"),
-    "usdz": _stage(".usdz"),
     "usda-tets": _stage(".usda", tets=True),
     "usdc-tets": _stage(".usdc", tets=True),
     "scene": _scene,
-    "msh-2": _meshio(".msh", file_format="gmsh22", binary=False),
-    "msh-2-binary": _meshio(".msh", file_format="gmsh22", binary=True),
     "msh-4": _meshio(".msh", file_format="gmsh", binary=False),
     "msh-4-binary": _meshio(".msh", file_format="gmsh", binary=True),
     "mesh": _meshio(".mesh"),
@@ -381,33 +339,22 @@ SEEDS: dict[str, Callable[[Path], Path]] = {
     "tetgen": _tetgen,
     "vol": _netgen,
     "vol.gz": _netgen_gz,
-    "vtk": _vtk(".vtk"),
     "vtk-4": _vtk(".vtk", version=42),
-    "vtk-text": _vtk(".vtk", binary=False),
-    "vtk-image": _vtk_image(".vtk"),
     "vtu": _vtk(".vtu"),
-    "vtu-text": _vtk(".vtu", binary=False),
-    "vtu-meshio": _meshio(".vtu"),
     "vtp": _vtp,
     "vtm": _vtk(".vtm", binary=False),
-    "vts": _lattice(".vts"),
-    "vtr": _lattice(".vtr"),
     "pvtu": _pvtu,
     "vtkhdf": _vtk(".vtkhdf"),
-    "vti": _vtk_image(".vti"),
+    "vti": _vti,
     "xdmf": _meshio(".xdmf", data_format="XML"),
     "med": _meshio(".med"),
     "cgns": _meshio(".cgns"),
     "su2": _meshio(".su2"),
-    "avs": _meshio(".avs"),
-    "f3grid": _meshio(".f3grid"),
     "nii": _nibabel(".nii"),
     "nii.gz": _nibabel(".nii.gz"),
     "nrrd": _itk(".nrrd"),
-    "nrrd-gz": _itk(".nrrd", compress=True),
     "nhdr": _itk(".nhdr"),
     "mha": _itk(".mha"),
-    "mhd": _itk(".mhd"),
     "dicom": _dicom,
     "run": _run,
     "checkpoint": _checkpoint(False),

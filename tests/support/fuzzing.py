@@ -40,35 +40,9 @@ MESHED_EVERY, HELD_EVERY, MADE_EVERY = 100, 4, 10
 #: Of the first cases, which the short run has, fewer get supports or a domain from their surface, and none a mesh.
 FIRST, FIRST_HELD_EVERY, FIRST_ENCLOSED_EVERY = 300, 20, 5
 #: Formats whose seed is tetrahedra: their number is not reported.
-TETRAHEDRA = {
-    "usda-tets",
-    "usdc-tets",
-    "bdf",
-    "inp",
-    "tetgen",
-    "vol",
-    "vol.gz",
-    "run",
-    "mesh",
-    "meshb",
-    "vtk",
-}
-TETRAHEDRA |= {
-    "vtk-4",
-    "vtk-text",
-    "vtm",
-    "vts",
-    "vtr",
-    "pvtu",
-    "vtkhdf",
-    "xdmf",
-    "med",
-    "cgns",
-    "su2",
-    "avs",
-    "f3grid",
-}
-TETRAHEDRA |= {form for form in SEEDS if form.startswith(("msh", "vtu"))}
+TETRAHEDRA = {form for form in SEEDS if form.startswith(("msh", "vtu", "mesh", "vol"))}
+TETRAHEDRA |= {*("usda-tets", "usdc-tets", "bdf", "inp", "tetgen", "run", "vtk-4", "vtm", "pvtu", "vtkhdf", "xdmf")}
+TETRAHEDRA |= {*("med", "cgns", "su2")}
 
 
 class Reached(BaseException):

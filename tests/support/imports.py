@@ -1,12 +1,8 @@
-"""The graph of imports within ``warp_corot``, lazy ones and those for type checkers included.
-
-``python tests/support/imports.py`` prints its circles and the imports from a lower floor to a higher one.
-"""
+"""The graph of imports within ``warp_corot``, lazy ones and those for type checkers included."""
 
 from __future__ import annotations
 
 import ast
-import sys
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import cache
@@ -149,22 +145,3 @@ def _targets(node: ast.Import | ast.ImportFrom, package: list[str], files: dict[
                 if ".".join(candidate) in files:
                     yield ".".join(candidate)
                     break
-
-
-def main() -> None:
-    edges = imports()
-    print(f"{len(modules())} modules, {len(edges)} imports")
-    for kinds in (("load",), ("load", "lazy"), ("load", "lazy", "type")):
-        sizes = [len(each) for each in circles(e for e in edges if e.kind in kinds)]
-        print(f"circles of {', '.join(kinds)} imports: {sizes}")
-    for circle in circles(edges):
-        print(f"\n{len(circle)} modules: {', '.join(circle)}")
-    against = against_the_floors(edges)
-    print(f"\n{len(against)} imports against the floors:")
-    for edge in against:
-        floors = (FLOORS[floor_of(name)][0] for name in (edge.source, edge.target))
-        print(f"  {edge.source}:{edge.line} -> {edge.target} ({edge.kind}): {' -> '.join(floors)}")
-
-
-if __name__ == "__main__":
-    sys.exit(main())

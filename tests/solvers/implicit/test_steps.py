@@ -6,7 +6,7 @@ import numpy as np
 import oracle
 import pytest
 import warp as wp
-from beams import beam, stretched
+from beams import beam
 from cases import oracle_mesh
 from scipy.linalg import eigh
 
@@ -264,16 +264,6 @@ def test_a_thin_sheet_that_is_pulled_keeps_its_volume(device):
         assert replace(surface, points=moved).volume == pytest.approx(surface.volume, rel=0.03)
     still = sim.energy()
     assert still.kinetic < 1e-3 * still.elastic
-
-
-def test_a_stretched_bar_contracts_with_each_law(device):
-    """One step of 10 ms after a stretch by 30 %: every law pulls the end back, and none overshoots to beyond rest."""
-    for law in (wc.Linear(), wc.Corotated(), wc.NeoHookean(), wc.StVenantKirchhoff(), wc.MassSpring()):
-        body = stretched(beam(device), 0.3)
-        sim = wc.Simulation(body, model=law, integrator=wc.BackwardEuler(dt=0.01), gravity=(0, 0, 0))
-        sim.advance_steps(1)
-        tip = body.displacements.numpy()[:, 2].max()
-        assert -0.01 < tip < 0.3 * 0.192
 
 
 @pytest.mark.parametrize(

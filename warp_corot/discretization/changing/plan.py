@@ -15,7 +15,6 @@ from warp_corot.discretization.groups import cubes_of
 from warp_corot.discretization.plan import LeafCounts, Sharing, Units
 from warp_corot.discretization.planner import GRANULE, PlanArrays, Planner, Room
 from warp_corot.discretization.sizes import allocated
-from warp_corot.kernels.elements.cpu import rest_matrices
 from warp_corot.kernels.elements.elements import ForestElements
 from warp_corot.kernels.plan import changing as kernels
 from warp_corot.kernels.plan.plan import Plan, Tree
