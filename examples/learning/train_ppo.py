@@ -30,12 +30,17 @@ parser.add_argument("--rollouts", type=int, default=24, help="rollouts, each wit
 parser.add_argument("--steps", type=int, default=64, help="steps of a rollout")
 parser.add_argument("--minutes", type=float, default=math.inf, help="no rollout begins after so long")
 parser.add_argument("--seed", type=int, default=0)
+parser.add_argument("--cells", type=int, default=1, help="factor on the cubes along each edge of the body")
+parser.add_argument("--integrator", default="explicit", choices=("explicit", "implicit"))
+parser.add_argument("--policy", help="a file of a policy to begin with (.pt)")
 parser.add_argument("-o", "--output", help="a file for the policy (.pt)")
+parser.add_argument("--episodes", type=int, default=0, help="so many episodes on each of four bodies, at the end")
 parser.add_argument("--plot", help="a picture of rewards and successes over steps (.png); it needs matplotlib")
 args = parser.parse_args()
 
 set_seed(args.seed)
-env = getattr(envs, args.task)(args.worlds, array="torch", autoreset="same_step", device=args.device)
+options = {"array": "torch", "autoreset": "same_step", "device": args.device}
+env = getattr(envs, args.task)(args.worlds, cells=args.cells, integrator=args.integrator, **options)
 observations, _ = env.reset(seed=args.seed)
 device = observations.device
 spaces = {"observation_space": env.single_observation_space, "action_space": env.single_action_space}
@@ -92,6 +97,23 @@ agent = PPO(
 agent.cfg.experiment.write_interval = agent.cfg.experiment.checkpoint_interval = 0
 agent.init()
 agent.enable_training_mode(True)
+if args.policy:
+    agent.load(args.policy)
+
+
+def successes(cells, integrator):
+    """How many of so many episodes the policy's mean ends with success, on another body or steps."""
+    tried = getattr(envs, args.task)(args.episodes, cells=cells, integrator=integrator, **options)
+    seen, _ = tried.reset(seed=1000)
+    over = succeeded = torch.zeros(args.episodes, dtype=torch.bool, device=device)
+    with torch.no_grad():
+        while not over.all():
+            _, outputs = agent.act(seen, None, timestep=0, timesteps=0)
+            seen, _, terminated, truncated, info = tried.step(outputs["mean_actions"])
+            succeeded = succeeded | (info["success"] & ~over)
+            over = over | terminated | truncated
+    return len(tried.scene.mesh.tets), int(succeeded.sum())
+
 
 start, curve = time.perf_counter(), []
 for rollout in range(args.rollouts):
@@ -134,4 +156,9 @@ if args.plot:
         each.set(xlabel="thousand steps of all worlds", ylabel=label)
         each.grid(alpha=0.3)
     fig.savefig(args.plot, dpi=110)
-assert math.isfinite(mean)
+if args.episodes:
+    agent.enable_training_mode(False)
+    for cells, integrator in ((1, "explicit"), (1, "implicit"), (2, "explicit"), (2, "implicit")):
+        elements, succeeded = successes(cells, integrator)
+        print(f"{elements} elements, {integrator} steps: {succeeded} of {args.episodes} episodes succeeded", flush=True)
+assert all(math.isfinite(mean) for _, mean, _ in curve)
