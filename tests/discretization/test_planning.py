@@ -3,12 +3,14 @@
 import numpy as np
 import pytest
 import warp as wp
-from plan_oracle import OraclePlan, OracleUnits
+from plan_oracle import OraclePlan, OracleUnits, complete_subtrees
 
 import warp_corot as wc
 from warp_corot.discretization.elements import all_frames
 from warp_corot.discretization.plan import GROUPED_LEAVES, Sharing
 from warp_corot.discretization.planner import ForcePlan, pays_in_groups
+from warp_corot.kernels.elements.shapes import STIFFNESS_LAMBDA, STIFFNESS_MU
+from warp_corot.kernels.tables import subtree
 from warp_corot.kernels.tables.shapes import FRAME_SHIFT
 
 MATERIAL = wc.Isotropic(young=1e4, poisson=0.4, density=1000.0)
@@ -167,3 +169,49 @@ def test_a_parents_frame_follows_from_its_childs():
     found = table.of_parents[codes[child] >> FRAME_SHIFT, tree.level[child] % 3, which]
     assert set(which) == {0, 1}
     assert np.array_equal(found | (tree.level[child] - 1), codes[tree.parent[child]])
+
+
+@pytest.mark.parametrize("level", [2, 5, 7])
+@pytest.mark.parametrize("rotation_level", [None, 3, 5])
+def test_every_leaf_is_computed_once(level, rotation_level, device):
+    forest = mixed(level)
+    plan = ForcePlan.of_forest(forest, rotation_level, wp.get_device(device))
+    leaves = [batch.subtrees.first.numpy()[:, None] + np.arange(8) for batch in plan.batches]
+    for batch, own in zip(plan.batches, leaves, strict=True):
+        assert (forest.levels[own] % 3 == batch.shape).all()
+        assert (forest.levels[own] == forest.levels[own[:, :1]]).all()
+    done = np.concatenate([plan.flat.leaves.numpy(), *map(np.ravel, leaves)])
+    assert np.array_equal(np.sort(done), np.arange(len(forest.tets)))
+
+
+@pytest.mark.parametrize("depth", [3, 6])
+def test_complete_subtrees_are_those_of_the_tree(depth):
+    """Those of the oracle."""
+    forest = mixed(6)
+    tree, leaves = forest.tree, forest.tree.leaves
+    expected = []
+    for root in range(len(tree.tets)):
+        below = [root]
+        for _ in range(depth):
+            below = [c for p in below if tree.first_child[p] >= 0 for c in tree.first_child[p] + np.arange(2)]
+        if len(below) == 2**depth and (tree.first_child[below] < 0).all():
+            expected.append(np.flatnonzero(leaves == below[0])[0])
+    assert np.array_equal(complete_subtrees(forest, depth), np.sort(expected))
+
+
+@pytest.mark.parametrize("shape", range(3))
+def test_subtree_tables(shape):
+    """Ten nodes, or 35 (37 for type 2) for six levels; the stiffness of a subtree is the sum over its leaves."""
+    assert len(subtree.POSITIONS[shape]) == 10
+    assert len(subtree.group_nodes(shape)) == (37 if shape == 2 else 35)
+    assert sum(map(len, subtree.group_sources(shape))) == 80
+    frames = np.array(subtree.FRAMES[shape])
+    np.testing.assert_allclose(np.einsum("lca,lda->lcd", frames, frames), np.tile(np.eye(3), (8, 1, 1)), atol=1e-12)
+    for part, table in zip(subtree.stiffness(shape), (STIFFNESS_LAMBDA[shape], STIFFNESS_MU[shape]), strict=True):
+        total = np.zeros((30, 30))
+        for leaf, frame in zip(subtree.LEAVES[shape], frames, strict=True):
+            turn = np.kron(np.eye(4), frame.T)
+            at = (3 * np.array(leaf)[:, None] + np.arange(3)).ravel()
+            total[np.ix_(at, at)] += 0.5 * turn @ np.array(table) @ turn.T
+        np.testing.assert_allclose(part, total, atol=1e-12)
+        np.testing.assert_allclose(part, np.transpose(part), atol=1e-12)
