@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
-import scipy.ndimage
+import scipy
 import warp as wp
 
 from warp_corot.domain.signed import SignedFunction

@@ -176,12 +176,14 @@ def surface_domain(surface: Surface, unit: str | float | None, up_axis: str | No
         domain = SurfaceDomain(closed, notes, up_axis=axis, device=device)
     except InputError as error:
         raise InputError(f"{source}{error}") from None
-    doubts = [] if unit is not None else [unlikely_size(float(np.ptp(domain.bounds, axis=0).max()), metres)]
+    size = None if unit is not None else unlikely_size(float(np.ptp(domain.bounds, axis=0).max()), metres)
+    doubts = [size] if size else []
+    domain.notes += doubts  # the report has a line on holes
     if closed.cap_share > LARGE_HOLES:
-        where = f"walls inside it at {closed.crowded} edges" if closed.crowded else f"its {closed.holes} holes"
+        holes = f"its {closed.holes} hole{'s'[: closed.holes != 1]}"
+        where = f"walls inside it at {closed.crowded} edges" if closed.crowded else holes
         doubts.append(f"the surface is open: {where} took {closed.cap_share:.1%} of its area to close")
-    for doubt in filter(None, doubts):
-        domain.notes.append(doubt)
+    for doubt in doubts:
         warnings.warn(f"{source}{doubt}", UserWarning, stacklevel=3)
     return domain
 

@@ -6,10 +6,9 @@ import warnings
 
 import numpy as np
 import numpy.typing as npt
+import scipy
 import warp as wp
 from numpy.typing import ArrayLike, NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 #: Fewer numbers are left to NumPy.
 FEW = 20_000
@@ -158,9 +157,9 @@ def face_pairs(tets: Array) -> Array:
 
 def linked(pairs: Array, count: int) -> Array:
     """The number of the connected part that each of ``count`` items belongs to, from pairs [m, 2] that are linked."""
-    links = coo_array((np.ones(len(pairs), np.int8), pairs.T), shape=(count, count))
+    links = scipy.sparse.coo_array((np.ones(len(pairs), np.int8), pairs.T), shape=(count, count))
     # In 64 bits, since callers multiply.
-    return connected_components(links, directed=False)[1].astype(np.int64)
+    return scipy.sparse.csgraph.connected_components(links, directed=False)[1].astype(np.int64)
 
 
 def connected(tets: Array) -> Array:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
-from scipy.sparse import csr_array
+import scipy
 
 from warp_corot.domain.units import volume
 from warp_corot.errors import InputError
@@ -233,7 +233,7 @@ def _beside(forest: ForestArrays, ends: np.ndarray, x: np.ndarray, moves: np.nda
     near = np.flatnonzero(np.isin(forest.tets, ends).any(axis=1))
     corners = forest.tets[near]
     rows = corners.ravel(), np.repeat(np.arange(len(near)), 4)
-    around = csr_array((np.ones(corners.size), rows), shape=(forest.node_count, len(near)))
+    around = scipy.sparse.csr_array((np.ones(corners.size), rows), shape=(forest.node_count, len(near)))
     # An edge of a leaf that was left out may be of no element: then its inner end counts.
     is_whole = around[ends[:, 0]].multiply(around[ends[:, 1]]).sum(axis=1) > 0.0
     found = (around[ends[:, 0]] + around[np.where(is_whole, ends[:, 1], ends[:, 0])]).tocoo()
