@@ -62,7 +62,7 @@ class Visits:
     first_place: wp.array[wp.int32]  # [bodies]
     places: wp.array[wp.int32]  # [S] that number at the last visit to a place
     touches: wp.array[wp.int32]  # [O T] the same for an obstacle and a triangle
-    contacts: wp.array[wp.int32]  # contacts of places and of pairs that may act, by their numbers in ``mass_split``
+    contacts: wp.array[wp.int32]  # contacts of places that may act, by their numbers in ``mass_split``
     contact_count: wp.array[wp.int32]  # [1]
     carriers: wp.array[wp.int32]  # [N] that number when the motion of a carrier was found last
     # Lists for each body, from its first place or carrier on, and how many there are in each, [bodies]:
@@ -75,14 +75,6 @@ class Visits:
     triangles: wp.array[wp.vec3i]  # [T]
     corner_starts: wp.array[wp.int32]  # [S + 1] the triangles around each place, see ``Skin``
     corners: wp.array[wp.int32]
-    # [S] displacements of places at the last search for pairs; how far they have come from there, and go in this step
-    # without contact, as carriers [N] do; and the means of these in each world, [W] [m]
-    searched: wp.array[wp.vec4]
-    gone: wp.array[wp.vec4]
-    goes: wp.array[wp.vec4]
-    carried: wp.array[wp.vec4]
-    mean_gone: wp.array[wp.vec4]
-    mean_goes: wp.array[wp.vec4]
     is_shared: int  # whether several threads visit at the same time
 
 

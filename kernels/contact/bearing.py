@@ -11,10 +11,11 @@ import warp as wp
 
 from warp_corot.kernels.elements.elements import add_force, load_node, store_node
 from warp_corot.kernels.implicit.assembled import Couplings, couple
+from warp_corot.kernels.modules import INLINED
 
 from .motion import Foreseen, Surface
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": INLINED})
 
 
 @wp.func

@@ -4,7 +4,7 @@ import warp as wp
 
 from .bearing import is_borne
 from .closest import on_segments, on_triangle, point_of
-from .explicit_rows import FORESEEN
+from .explicit_rows import FORESEEN, WAITS
 from .law import Law, across, held_back
 from .motion import Surface
 from .rows import BAND, BAND_AT_REST, BAND_OF_NEIGHBOURS, Meeting, Rows, triangle_normal
@@ -19,6 +19,8 @@ ACROSS = wp.constant(0.1)
 SLIVER = wp.constant(0.1)
 #: A node this far outside a triangle's border, relative to the triangle's size, still counts as being at the triangle.
 BORDER = wp.constant(0.02)
+#: Motion is rounded by less than this.
+ROUNDED = wp.constant(1.0001)
 #: Fraction of an edge at each end that is left to its nodes; and the least sine of the angle between edges that are not
 #: parallel.
 ENDS = wp.constant(1.0e-3)
@@ -322,6 +324,24 @@ def locate_facing(row: int, surface: Surface, meeting: Meeting, rows: Rows) -> b
 def list_by_warp(live: wp.array[wp.int32], count: wp.array[wp.int32], row: int, is_live: int):
     """Add a row to a list, or not. All threads of a warp must call it: they ask for their places together."""
     ...
+
+
+@wp.func
+def is_apart(row: int, law: Law, surface: Surface, meeting: Meeting, rows: Rows):
+    """Whether a pair without a force cannot touch in this step: the relative motion of its places has not used up the
+    distance that was between them at the last search."""
+    owner = rows.owner[row]
+    if rows.acts[row] > WAITS or owner < 0:
+        return owner < 0
+    p = rows.places[row]
+    first = wp.where(owner < meeting.body.shape[0], 1, 2)
+    most = float(0.0)
+    for k in range(2):
+        for m in range(1, 4):
+            if k < first and m >= first:
+                gone = surface.x[p[k]] - meeting.searched[p[k]] - surface.x[p[m]] + meeting.searched[p[m]]
+                most = wp.max(most, wp.length(gone) + FORESEEN * wp.length(surface.d[p[k]] - surface.d[p[m]]))
+    return ROUNDED * most + law.closing < rows.away[row]
 
 
 @wp.func

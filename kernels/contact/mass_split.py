@@ -24,7 +24,7 @@ from warp_corot.kernels.stepping.threads import spread_thread, synchronize_block
 from .bearing import MOSTLY, is_borne, left_between, loose_share
 from .explicit_rows import ACTS, BEGINS, ENDS, OUT, WAITS, Rigid, anchor, begin_place, find_touch
 from .law import Law, across, held_back, least_motion, left_to_held
-from .locate import list_by_warp, locate_row
+from .locate import is_apart, list_by_warp, locate_row
 from .motion import Surface
 from .rows import Meeting, Rows, row_count
 from .watch import BESIDE, Near
@@ -490,8 +490,7 @@ def solver(has_triangles: bool, has_pairs: bool, on_cpu: bool) -> wp.Kernel:
             awake: Whether contact is awake, [1]; there are no contacts if it is not.
             are_separate: Whether no two contacts share a node: places that are nodes, and one obstacle. Then a thread
                 goes through all phases of a place by itself.
-            listed, listed_count: On the CPU the contacts of places and of pairs that may act, and how many there are;
-                empty: any.
+            listed, listed_count: On the CPU the contacts of places that may act, and how many there are; empty: any.
             records: On the CPU memory for as many contacts as there usually are.
         """
         thread = part + wp.tid()
@@ -517,6 +516,10 @@ def solver(has_triangles: bool, has_pairs: bool, on_cpu: bool) -> wp.Kernel:
                     number = listed[k]
                 else:
                     number = all.rigid.first_triangle + near.touches[k - listed_count[0]]
+                if wp.static(on_cpu and has_pairs):
+                    row = number - all.first_pair
+                    if row >= 0 and is_apart(row, all.rigid.law, all.rigid.surface, all.meeting, all.pairs):
+                        number = -1
                 may_act = int(0)
                 if number >= 0:
                     may_act = locate(number, dt, all, sums)

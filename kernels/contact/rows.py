@@ -32,6 +32,7 @@ class Meeting:
     normals: wp.array[wp.vec3]  # [T] at the last search
     outs: wp.array[wp.vec3]  # [E] the sums of the two normals at each edge, at the last search
     reach: wp.array[wp.float32]  # [S] how far a node may move until the next search for pairs [m]
+    searched: wp.array[wp.vec3]  # [S] positions at the last search [m]
     ahead: wp.array[wp.vec3]  # see ``Watch``
     roots: wp.array3d[wp.int32]  # [2, worlds, bodies] the bodies' roots in the trees of triangles and of edges; CUDA
     meets_itself: int

@@ -9,11 +9,12 @@ find nothing reserve more and more for all nodes, until they find something.
 import warp as wp
 
 from warp_corot.kernels.elements.elements import load_node
+from warp_corot.kernels.modules import INLINED
 from warp_corot.kernels.stepping.pace import DONE, DT, Pace
 
 from .motion import Motions, Surface, distance_between, move_obstacle
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": INLINED})
 
 #: An item may move this many times its motion in the present step until the next search, besides the minimum.
 AHEAD = wp.constant(16.0)
@@ -34,8 +35,6 @@ HIT, HIT_BESIDE = wp.constant(2.0), wp.constant(8.0)
 ALONE = wp.constant(4.0)
 #: Only one of so many nodes is asked for the common motion; that is summed in multiples of an element's size over this.
 ASKED, PARTS = wp.constant(16), wp.constant(1048576.0)
-#: A new search is due after this fraction of the limit. The rest is for the effect of contact on a step.
-SKIN = wp.constant(0.5)
 
 
 @wp.struct
@@ -55,8 +54,12 @@ class Watch:
     common: wp.array[wp.vec3]
     asked: wp.array2d[wp.int64]  # [W, 4] sum of motions in the step of the search, and the number of nodes
     size: float  # size of the smallest element [m]
-    most_alone: float  # how many elements nodes with nothing near may move
+    alone: float  # how many times as far nodes with nothing near may move, and how many elements
+    most_alone: float
     hit: float  # how many times the largest motion is reserved for anything
+    skin: float  # a new search is due after this fraction of the limit; the rest is for the effect of contact on a step
+    rest: float  # so much more of the limit is for it [m]
+    steps: float  # for so many more steps like the present one it must suffice
     # [S] in implicit steps: how far places are expected to go in the step of the search beyond the frame, around which
     # ``reach`` is what they may stray, and how far they have strayed [m]; else empty
     ahead: wp.array[wp.vec3]
@@ -77,11 +80,11 @@ class Watch:
 
 
 @wp.func
-def stays(gone: float, next_step: float, reach: float):
+def stays(gone: float, next_step: float, reach: float, watch: Watch):
     """Whether an item that has moved this far can make another step before the next search; false for values that are
     not finite.
     """
-    return gone + next_step <= SKIN * reach
+    return gone + watch.steps * next_step <= watch.skin * reach - watch.rest
 
 
 @wp.func
@@ -97,7 +100,7 @@ def reserved(step: float, fastest: float, farther: float, hit: float, watch: Wat
     many times as far; ``hit``: how many times the largest motion if it is hit."""
     farthest = wp.max(wp.min(farther, watch.most_alone) * watch.size, FAST * step)
     ahead = wp.min(farther * AHEAD * step, farthest)
-    return watch.least[0] + wp.min(ahead + hit * fastest, FARTHEST * watch.size)
+    return watch.rest + watch.least[0] + wp.min(ahead + hit * fastest, FARTHEST * watch.size)
 
 
 @wp.func
@@ -133,7 +136,7 @@ def watch_nodes(surface: Surface, watch: Watch):
     world = surface.world[s]
     common = watch.common[world]
     gone = way_from_search(s, surface, watch) + common
-    if not stays(wp.length(gone), wp.length(surface.d[s] - common), watch.reach[s]):
+    if not stays(wp.length(gone), wp.length(surface.d[s] - common), watch.reach[s], watch):
         wake(watch)
 
 
@@ -143,7 +146,7 @@ def follow_node(s: int, surface: Surface, watch: Watch):
     world = surface.world[s]
     step = surface.d[s]
     gone = wp.length(way_from_search(s, surface, watch) + step)
-    if not stays(gone, wp.length(step - watch.common[world]), watch.reach[s]):
+    if not stays(gone, wp.length(step - watch.common[world]), watch.reach[s], watch):
         wake(watch)
         if gone > watch.reach[s] and watch.ahead.shape[0] == 0:
             wp.atomic_add(watch.missed, 0, 1)
@@ -181,7 +184,7 @@ def begin_obstacle(
         later = motions.later[world, o]
         step = distance_between(motions.now[world, o], later, reach)
         gone = distance_between(watch.poses[world, o], later, reach)
-        if not stays(gone, step, watch.reach_of[world, o] + watch.free[1]):
+        if not stays(gone, step, watch.reach_of[world, o] + watch.free[1], watch):
             wake(watch)
 
 
@@ -312,7 +315,7 @@ def begin_search(s: int, obstacles: int, surface: Surface, motions: Motions, wat
     if s < surface.node.shape[0]:
         farther = float(1.0)
         if obstacles == 0 and (near.flags[s] & SOMETHING) == 0:
-            farther = ALONE
+            farther = watch.alone
         reserve_node(s, farther, surface, watch)
         near.flags[s] = 0
     if s == 0:
@@ -401,9 +404,9 @@ def rouse(
             if is_framed != 0:
                 step -= watch.common[nodes.world[s]]
             # Most nodes pass this test, without roots; (a + b)^2 is at most 2 (a^2 + b^2).
-            if not (2.0 * (wp.dot(gone, gone) + wp.dot(step, step)) <= SKIN * SKIN * free * free):
+            if not (2.0 * (wp.dot(gone, gone) + wp.dot(step, step)) <= watch.skin * watch.skin * free * free):
                 far = wp.length(gone)
-                if not stays(far, wp.length(step), free):
+                if not stays(far, wp.length(step), free, watch):
                     wake(watch)
                     if counts and far > free:
                         wp.atomic_add(watch.missed, 0, 1)

@@ -104,11 +104,11 @@ class Contacts:
         #: The forces of explicit steps.
         self.split = MassSplit(*given)
         self._is_explicit = False
-        #: Steps that visit only what may touch; None on CUDA and over ranks.
+        #: Steps that visit only what may touch obstacles; None on CUDA, over ranks, and if soft surfaces may touch.
         self.approach: Approach | None = None
-        if self.device.is_cpu and (self.rigid is not None or self.pairs is not None) and system.ranks.is_alone:
-            things = (system, made, self.search, self.obstacles, self.law, self.rigid, self.pairs, self.split)
-            self.approach = Approach(*things, self._predict, self._regions)
+        if self.device.is_cpu and self.rigid is not None and self.pairs is None and system.ranks.is_alone:
+            things = (system, made, self.search, self.obstacles, self.law, self.rigid, self.split)
+            self.approach = Approach(*things, self._regions)
         #: Steps while nothing is near; None on the CPU, where nothing can be left out, and without searches.
         self.sleep = Sleep(system, made, self.obstacles, self.search) if self.search.can_sleep else None
         self._revision = 0
@@ -201,6 +201,8 @@ class Contacts:
     def _act(self, offset: int, damping: float, *, moves: bool = False) -> None:
         """Launch the forces of a step; ``moves``: and the motion of obstacles."""
         system, surface = self.system, self.surface
+        if self.device.is_cpu:
+            self.search.watch.rest = 0.5 * self.law.closing
         self._predict(offset, damping, begins=True, moves=moves)
         self.search.launch(offset, follows=True, sleeps=self.sleep is not None)
         self.split.launch()

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
 
 import warp as wp
 
 from warp_corot.inputs.cpu_threads import Regions, Team, launch
-from warp_corot.kernels.contact import approach, nearing, sums
+from warp_corot.kernels.contact import approach, sums
 from warp_corot.kernels.contact import mass_split as kernels
 from warp_corot.kernels.contact.approach import Part, Visits
 from warp_corot.kernels.contact.explicit_rows import Rigid
@@ -131,7 +131,7 @@ class MassSplit:
         """Launch all phases of a step for what is near; None: what the last search has found.
 
         Args:
-            listed: The contacts of places and of pairs that may act, and how many there are; None: any.
+            listed: The contacts of places that may act, and how many there are; None: any.
         """
         near, self._listed = near or self._search.near, listed or (self._none, self._none)
         last = self.iterations + 1
@@ -194,7 +194,7 @@ def rigid_of(rigid: RigidForces | None, surface: ContactSurface, law: Law) -> Ri
 
 
 class Approach:
-    """Steps that look only at places and pairs which their motion may have brought together.
+    """Steps that look only at places which their motion may have brought to obstacles.
 
     Args:
         system: The bodies.
@@ -202,11 +202,8 @@ class Approach:
         search: Its margins.
         obstacles: The obstacles.
         law: The law of contact.
-        rigid: Contact with obstacles; None without.
-        pairs: Contact between soft surfaces; None if they cannot touch.
+        rigid: Contact with obstacles.
         split: The solver of contacts, which gets what is visited.
-        place: Launches the positions of all places and their motion without contact, from the ``offset`` and the
-            damping.
         regions: The threads.
 
     Attributes:
@@ -220,40 +217,36 @@ class Approach:
         search: Search,
         obstacles: Obstacles,
         law: Law,
-        rigid: RigidForces | None,
-        pairs: Pairs | None,
+        rigid: RigidForces,
         split: MassSplit,
-        place: Callable[[int, float], None],
         regions: Regions,
     ):
-        self._system, self._surface, self._search, self._pairs = system, surface, search, pairs
-        self._obstacles, self._law, self._rigid, self._split = obstacles, law, rigid, split
-        self._place, self._regions, self._device, self._taken = place, regions, surface.device, (-1, -1)
+        self._system, self._surface, self._search, self._split = system, surface, search, split
+        self._obstacles, self._law, self._rigid = obstacles, law, rigid
+        self._regions, self._device, self._taken = regions, surface.device, -1
         self.follow()
 
     @property
     def is_outdated(self) -> bool:
-        """Whether surfaces have other places, or there is other room for pairs."""
-        return self._taken != (self._surface.revision, 0 if self._pairs is None else self._pairs.room)
+        """Whether surfaces have other places."""
+        return self._taken != self._surface.revision
 
     def follow(self) -> None:
-        """Update to the present surfaces and the room for pairs."""
-        surface, device, room = self._surface, self._device, 0 if self._pairs is None else self._pairs.room
+        """Update to the present surfaces."""
+        surface, device = self._surface, self._device
         if self.is_outdated:
-            self._taken = (surface.revision, room)
+            self._taken = surface.revision
             places, bodies, carriers = surface.count, len(surface.parts), surface.count + surface.bearer_count
-            touches = 0 if self._rigid is None else self._rigid.touch_count
+            touches = self._rigid.touch_count
             bearing, visits = surface.arrays.bearing, Visits()
             visits.entries = wp.zeros(len(bearing.bearers), dtype=wp.vec4i, device=device)
             floats = {"ways": carriers, "needs": carriers, "until": len(bearing.places), "spans": places}
             floats |= {"came": 2}
-            vectors = {"budgets": carriers, "carried": carriers, "mean_gone": surface.worlds}
-            vectors |= {"searched": places, "gone": places, "goes": places, "mean_goes": surface.worlds}
             sizes = {"places": places, "touches": touches, "carriers": carriers, "due": carriers, "carrying": carriers}
-            sizes |= {"chosen": places, "contacts": self._obstacles.count * places + room}
+            sizes |= {"chosen": places, "contacts": self._obstacles.count * places}
             sizes |= dict.fromkeys(("chosen_count", "due_count", "carrying_count"), bodies)
             sizes |= dict.fromkeys(("is_first", "may_miss", "count", "contact_count"), 1)
-            for dtype, of in ((wp.float32, floats), (wp.int32, sizes), (wp.vec4, vectors)):
+            for dtype, of in ((wp.float32, floats), (wp.int32, sizes), (wp.vec4, {"budgets": carriers})):
                 for name, size in of.items():
                     setattr(visits, name, wp.zeros(size, dtype=dtype, device=device))
             visits.step = wp.zeros(1, dtype=wp.int64, device=device)
@@ -284,19 +277,11 @@ class Approach:
         system, watch, visits = self._system, self._search.watch, self._visits
         inputs = [self._obstacles.motions, system.pace.arrays, system.bodies[0].conditions.world_starts, offset]
         wp.launch(
-            approach.begin_visits, 1, [*inputs, self._rigid_arrays], [watch, self.here, visits], device=self._device
+            approach.begin_visits, 1, [*inputs, self._rigid.arrays], [watch, self.here, visits], device=self._device
         )
         if len(system.constraints) > 1:  # which add to them
             self._clear()
-        if self._rigid is not None:
-            self._over_parts(approach.find_due, offset, damping, [watch, visits])
-        if self._pairs is not None:
-            self._over_parts(nearing.foresee_carriers, offset, damping, [visits])
-            self._follow(nearing.BEFORE_STEP, offset)
-            wp.capture_if(watch.due, partial(self._find_pairs, offset, damping))
-            inputs = [self._split.first_pair, self._law.closing, self._surface.count]
-            outputs = [self._pairs.rows, watch, self.here, visits]
-            wp.launch(nearing.list_rows, 1, inputs, outputs, device=self._device)
+        self._over_parts(approach.find_due, offset, damping, [watch, visits])
         wp.capture_if(watch.awake, partial(self._act, offset, damping, accounts))
 
     def launch_end(self) -> None:
@@ -310,12 +295,6 @@ class Approach:
             wp.launch(approach.complete_triangles, 1, inputs, [self._surface.arrays], device=self._device)
 
     # --- pieces ----------------------------------------------------------------------------------------------------
-
-    @property
-    def _rigid_arrays(self) -> Rigid:
-        rigid = rigid_of(self._rigid, self._surface, self._law)
-        rigid.motions = self._obstacles.motions
-        return rigid
 
     def _part(self, k: int, damping: float) -> Part:
         """The surface of the k-th body, as a struct for approach."""
@@ -340,39 +319,11 @@ class Approach:
 
             self._regions.launch((kernel, k, offset), over)
 
-    def _follow(self, when: int, offset: int) -> None:
-        """Launch how far places have come since the last search, and the test whether another one is due."""
-        surface = self._surface
-        for k, of in enumerate(surface.parts):
-            bounds, part = self._regions.team.bounds(surface.worlds * of.nodes), self._part(k, 0.0)
-
-            def follow(number: int, start: int = of.start, bounds: list = bounds, part: Part = part) -> None:
-                begin, end = bounds[number]
-                inputs = [start + begin, start + end, part, surface.arrays]
-                launch(nearing.follow_places, 1, inputs, [self._visits], device=self._device)
-
-            self._regions.launch((nearing.follow_places, k, offset), follow)
-        inputs = [int(when), surface.arrays, self._law]
-        wp.launch(nearing.ask_for_search, 1, inputs, [self._search.watch, self._visits], device=self._device)
-
-    def _find_pairs(self, offset: int, damping: float) -> None:
-        """Launch a search for pairs."""
-        assert self._pairs is not None
-        inputs, watch = [self._surface.arrays, self._law], self._search.watch
-        watch.awake.fill_(1)
-        for when in (nearing.BEFORE_SEARCH, nearing.AFTER_SEARCH):
-            if when == nearing.AFTER_SEARCH:
-                self._place(offset, damping)
-                outputs = [watch, self._visits, self._search.near]
-                wp.launch(nearing.reserve_motion, 1, inputs, outputs, device=self._device)
-                self._pairs.find()
-            wp.launch(nearing.ask_for_search, 1, [int(when), *inputs], [watch, self._visits], device=self._device)
-
     def _act(self, offset: int, damping: float, accounts: list[wp.array] | None) -> None:
         """Launch the contact of a step in which anything is due."""
         threads, watch, pace = self._regions.team.parts, self._search.watch, self._system.pace.arrays
-        has_edges = int(self._rigid is not None and self._rigid.have_edges)
-        outputs = [self._rigid_arrays, self._visits, self.here]
+        has_edges = int(self._rigid.have_edges)
+        outputs = [self._rigid.arrays, self._visits, self.here]
         last = int(approach.LIMIT)
         spans = [(0, last)] if threads == 1 else [(phase, phase) for phase in range(last + 1)]
         for k in range(len(self._system.bodies)):

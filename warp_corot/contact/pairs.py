@@ -28,6 +28,8 @@ REBUILT = 100
 #: For so many elements at most motion is reserved while nothing is near, if bodies do not touch themselves, and if they
 #: do: then so much of the same body is that near that searches take longer.
 CALM, CALM_ITSELF = 8.0, 1.0
+#: How many times the largest motion is reserved on the CPU, where pairs that are near take longer than searches.
+HIT_ON_CPU = 1.0
 
 
 class Pairs:
@@ -57,7 +59,8 @@ class Pairs:
         self.surface, self.search, self.device = surface, search, surface.device
         self.friction, self.meets_itself, self._flat_edges = options.friction, options.self_contact, options.flat_edges
         self.revision, self._room, self._taken, self._built = 0, 0, -1, 0
-        search.watch.most_calm, search.watch.hit = CALM_ITSELF if self.meets_itself else CALM, float(HIT)
+        search.watch.most_calm = CALM_ITSELF if self.meets_itself else CALM
+        search.watch.hit = HIT_ON_CPU if self.device.is_cpu else float(HIT)
         if self.meets_itself:
             search.watch.most_alone = 1.0
         search.find_pairs = self.find
@@ -82,7 +85,8 @@ class Pairs:
         meeting.corner_starts, meeting.corners = surface.corner_starts, surface.corners
         meeting.normals = wp.zeros(surface.triangle_count, dtype=wp.vec3, device=device)
         meeting.outs = wp.zeros(edges, dtype=wp.vec3, device=device)
-        meeting.reach, meeting.ahead = self.search.watch.reach, self.search.watch.ahead
+        watch = self.search.watch
+        meeting.reach, meeting.searched, meeting.ahead = watch.reach, watch.places, watch.ahead
         meeting.meets_itself, meeting.friction = int(self.meets_itself), self.friction
         meeting.flat_edges = int(self._flat_edges)
         meeting.roots = wp.zeros((2, surface.worlds, len(surface.parts)), dtype=wp.int32, device=device)

@@ -11,7 +11,7 @@ import warp as wp
 from warp_corot.errors import UnstableError
 from warp_corot.kernels.contact import beside
 from warp_corot.kernels.contact import watch as kernels
-from warp_corot.kernels.contact.explicit_rows import Rigid
+from warp_corot.kernels.contact.explicit_rows import FORESEEN, Rigid
 from warp_corot.solvers.pace import Mapped
 
 from .surface import ContactSurface
@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 #: The least motion that is reserved for anything between two searches, as a fraction of the smallest element's size,
 #: and how many times as much after something that was hit has moved farther in one step than was reserved.
 LEAST, WIDER = 0.05, 4.0
+#: A new search is due after this fraction of what is reserved; the rest is for the effect of contact on a step.
+SKIN = 0.5
 #: Maximum number of threads that process a list on CUDA.
 MOST_THREADS = 1 << 18
 #: Number of threads of a block, and of resident blocks on each multiprocessor.
@@ -65,6 +67,9 @@ class Search:
         watch.least = wp.full(1, LEAST * size, dtype=wp.float32, device=device)
         watch.fastest = wp.zeros(1 + surface.worlds, dtype=wp.float32, device=device)
         watch.size, watch.most_alone, watch.hit = size, float(kernels.ALONE), float(kernels.HIT_BESIDE)
+        watch.alone = 1.0 if device.is_cpu else float(kernels.ALONE)
+        # On the CPU, ``Contacts`` leaves a distance for contact, within which steps look at all pairs.
+        watch.skin, watch.steps = (1.0, float(FORESEEN)) if device.is_cpu else (SKIN, 1.0)
         watch.due, watch.missed, watch.searches = (wp.zeros(1, dtype=wp.int32, device=device) for _ in range(3))
         self._arrived = wp.zeros(1, dtype=wp.uint32, device=device)
         watch.awake = wp.ones(1, dtype=wp.int32, device=device)
@@ -146,6 +151,7 @@ class Search:
         """Serve implicit steps, each with a search along the way that is expected, from which anything may stray by a
         motion, and at most an extent [m]."""
         self._foresees, self.farthest = True, max(self.farthest, extent)
+        self.watch.skin, self.watch.steps = SKIN, 1.0
         self._foresee()
         motion = min(motion, self.farthest / WIDER)
         if motion > float(self.watch.least.numpy()[0]):
@@ -183,7 +189,7 @@ class Search:
         """
         if not self.is_needed:
             return
-        if offset == 0:
+        if offset == 0 or (self.device.is_cpu and not self._foresees):
             self._on_nodes(kernels.watch_nodes, [self.surface.arrays, self.watch])
         search = partial(self._search, follows and not self.obstacles.count, sleeps)
         # A branch takes longer on CUDA than a launch that ends at once, and a search beside obstacles is one launch.

@@ -39,7 +39,7 @@ IMPLICIT_ON_FORESTS = (
 #: Modules for explicit contact, besides its solver; and those for soft surfaces on the CPU.
 CONTACT = ("contact.explicit_step", "contact.sums", "contact.beside", "contact.watch", "contact.bearing")
 CONTACT_ON_CPU = ("contact.approach", "contact.explicit_step", "contact.sums", "contact.watch", "contact.bearing")
-PAIRS_ON_CPU = ("contact.rows", "contact.wide_tree", "contact.nearing", "contact.motion")
+PAIRS_ON_CPU = ("contact.rows", "contact.wide_tree", "contact.beside", "contact.motion")
 
 #: A kernel, or one with the number of threads of its blocks on CUDA, if that is not Warp's default.
 LoadedKernel: TypeAlias = wp.Kernel | tuple[wp.Kernel, int]
