@@ -160,35 +160,6 @@ def gather_particles(
 
 
 @wp.kernel(enable_backward=False)
-def gather_nodes(
-    # In
-    particles: wp.array[wp.int32],
-    all: wp.array[wp.vec4],
-    # Out
-    u: wp.array[wp.vec4],
-):
-    """Displacements of a forest's nodes."""
-    k = wp.tid()
-    store_node(u, k, load_node(all, particles[k]))
-
-
-@wp.kernel(enable_backward=False)
-def add_nodes(
-    # In
-    particles: wp.array[wp.int32],
-    # In and out
-    nodal: wp.array[wp.vec4],
-    # Out
-    f: wp.array[wp.vec4],
-):
-    """Add a forest's nodal forces to the particles' and reset them to zero. A particle is at most one node."""
-    k = wp.tid()
-    i = particles[k]
-    store_node(f, i, load_node(f, i) + load_node(nodal, k))
-    store_node(nodal, k, wp.vec3())
-
-
-@wp.kernel(enable_backward=False)
 def step_particles(
     # In
     dt: float,

@@ -3,7 +3,7 @@ ground before Newton has listed them, and light nodes meet stiff contacts."""
 
 import numpy as np
 import pytest
-from newton_scenes import builder, contact_parameters, newton, wc, wn
+from newton_scenes import builder, contact_parameters, newton, stepped, wc, wn
 
 RADIUS, GAP, FRAMES = 0.002, 0.01, 22
 
@@ -29,16 +29,10 @@ def test_it_stands_and_throws_nothing(device, options):
     model = organ_above_ground(device)
     bound = 2.0 * np.sqrt(2.0 * 9.81 * model.particle_q.numpy()[:, 2].max())
     solver, pipeline = wn.SolverCorotated(model, **options), newton.CollisionPipeline(model, soft_contact_gap=GAP)
-    contacts, now, after = pipeline.contacts(), model.state(), model.state()
     lowest, fastest = [], []
-    for _ in range(FRAMES):
-        now.clear_forces()
-        pipeline.collide(now, contacts)
-        solver.step(now, after, None, contacts, 1 / 60)
-        now, after = after, now
+    for now in stepped(solver, model, FRAMES, 1 / 60, pipeline=pipeline):
         lowest.append(now.particle_q.numpy()[:, 2].min())
         fastest.append(np.linalg.norm(now.particle_qd.numpy(), axis=1).max())
-    solver.check()
     assert min(lowest) > -GAP
     assert lowest[-1] > 0.0
     assert max(fastest) < bound

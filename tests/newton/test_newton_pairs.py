@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import warp as wp
-from newton_scenes import add_grid, builder, checked_step, contact_parameters, impulse, newton, wc, wn
+from newton_scenes import add_grid, builder, checked_step, contact_parameters, impulse, newton, stepped, wc, wn
 
 MARGIN = 0.01
 
@@ -31,16 +31,11 @@ def run_pairs(model, steps, dt=5e-4, margin=MARGIN, each=None, state=None, **opt
     pipeline.init_soft_self_contact(margin=MARGIN, gap=MARGIN)
     contacts = pipeline.contacts()
     solver = wn.SolverCorotated(model, self_contact_margin=margin, **options)
-    before, after = model.state() if state is None else state, model.state()
-    for _ in range(steps):
-        before.clear_forces()
-        pipeline.collide(before, contacts, soft_self_contact=True)
-        solver.step(before, after, None, contacts, dt)
-        before, after = after, before
+    where = {"pipeline": pipeline, "contacts": contacts, "state": state, "collides": {"soft_self_contact": True}}
+    for last in stepped(solver, model, steps, dt, **where):
         if each is not None:
-            each(before)
-    solver.check()
-    return before, pipeline, contacts, solver
+            each(last)
+    return last, pipeline, contacts, solver
 
 
 def height_of(state, first):
@@ -63,12 +58,8 @@ def test_a_soft_body_carries_another(device):
 
 def test_without_a_margin_they_pass_through(device):
     model, first = cube_on_slab(device)
-    before, after = model.state(), model.state()
-    solver = wn.SolverCorotated(model)
-    for _ in range(400):
-        solver.step(before, after, None, None, 5e-4)
-        before, after = after, before
-    assert height_of(before, first) < 0.05
+    *_, state = stepped(wn.SolverCorotated(model), model, 400, 5e-4)
+    assert height_of(state, first) < 0.05
 
 
 def test_momentum_is_exchanged_and_no_energy_is_added(device):

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import warp as wp
-from newton_scenes import add_grid, builder, contact_parameters, newton, wn
+from newton_scenes import add_grid, builder, contact_parameters, newton, stepped, wn
 
 
 def gift(device, height=0.2, around=36, across=3):
@@ -39,16 +39,12 @@ def test_a_gift_falls_and_stays_tied(frames, device):
     solver = wn.SolverCorotated(model, self_contact_margin=0.04)
     pipeline = newton.CollisionPipeline(model)
     pipeline.init_soft_self_contact(margin=0.04, gap=0.02, topological_filter_threshold=1)
-    contacts, before, after = pipeline.contacts(), model.state(), model.state()
     mass = model.particle_mass.numpy().astype(float)
     start = model.particle_q.numpy().astype(float)
     falls = 0.0
-    for _ in range(10 * frames):
-        before.clear_forces()
-        pipeline.collide(before, contacts, soft_self_contact=True)
-        solver.step(before, after, None, contacts, 1.0 / 600.0)
-        before, after = after, before
-        x, v = before.particle_q.numpy().astype(float), before.particle_qd.numpy().astype(float)
+    touching = {"pipeline": pipeline, "collides": {"soft_self_contact": True}}
+    for state in stepped(solver, model, 10 * frames, 1.0 / 600.0, **touching):
+        x, v = state.particle_q.numpy().astype(float), state.particle_qd.numpy().astype(float)
         lost = 9.81 * float(mass @ (start - x)[:, 2])
         kinetic = 0.5 * float(mass @ (v * v).sum(axis=1))
         assert kinetic < 1.05 * max(lost, 0.0) + 20.0

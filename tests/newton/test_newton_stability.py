@@ -5,7 +5,7 @@ import warnings
 import numpy as np
 import pytest
 import warp as wp
-from newton_scenes import add_grid, builder, grid_model, newton, run, wc, wn
+from newton_scenes import add_grid, builder, grid_model, newton, run, stepped, wc, wn
 
 M = 0.02
 
@@ -302,13 +302,8 @@ class TestContactOfParticles:
         arms = np.linalg.norm(ijk[:, None] - ijk, axis=2)
         pairs = int((np.isclose(arms, np.sqrt(2.0))).sum()) // 2
         energy = 0.5 * ke * pairs * (0.02 * 2 * radius) ** 2
-        kinetic = []
-        now, after = model.state(), model.state()
-        for _ in range(200):
-            now.clear_forces()
-            solver.step(now, after, None, None, 0.7 * solver.contact_dt)
-            now, after = after, now
-            kinetic.append(0.5 * M * np.square(now.particle_qd.numpy().astype(float)).sum())
+        states = stepped(solver, model, 200, 0.7 * solver.contact_dt)
+        kinetic = [0.5 * M * np.square(state.particle_qd.numpy().astype(float)).sum() for state in states]
         assert len(ijk) == 55
         # With w^2 dt^2 below 2, a mode that begins at rest has at most twice its energy in its fastest moment.
         assert max(kinetic) < 2.0 * energy
@@ -326,12 +321,8 @@ class TestContactOfParticles:
             wn.SolverCorotated(model, particle_contact=True),
             newton.solvers.SolverSemiImplicit(model, enable_tri_contact=False),
         ):
-            now, after = model.state(), model.state()
-            for _ in range(20):
-                now.clear_forces()
-                solver.step(now, after, None, None, 2e-5)
-                now, after = after, now
-            ends.append(now.particle_qd.numpy()[8:])
+            *_, state = stepped(solver, model, 20, 2e-5)
+            ends.append(state.particle_qd.numpy()[8:])
         assert np.abs(ends[1] - model.particle_qd.numpy()[8:]).max() > 0.1
         np.testing.assert_allclose(ends[0], ends[1], atol=2e-5 * np.abs(ends[1]).max())
 

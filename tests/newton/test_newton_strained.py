@@ -7,7 +7,7 @@ import loaded
 import numpy as np
 import pytest
 import warp as wp
-from newton_scenes import add_grid, builder, newton, wc, wn
+from newton_scenes import add_grid, builder, newton, stepped, wc, wn
 
 FRAME = 1.0 / 60.0
 GRAVITY = 9.81
@@ -25,20 +25,12 @@ def followed(model, frames, *, up=2, contact=True, limit=1.05):
     """
     solver = wn.SolverCorotated(model)
     pipeline = newton.CollisionPipeline(model, soft_contact_gap=0.05) if contact else None
-    contacts = pipeline.contacts() if contact else None
-    now, after = model.state(), model.state()
     m = model.particle_mass.numpy().astype(float)
     floor = 0.0 if contact else lowest_point(model, up)
-    counts, energies = [], [energy(now, m, up, floor)]
-    for _ in range(frames):
-        now.clear_forces()
-        if contact:
-            pipeline.collide(now, contacts)
-        solver.step(now, after, None, contacts, FRAME)
-        now, after = after, now
+    counts, energies = [], [energy(model.state(), m, up, floor)]
+    for now in stepped(solver, model, frames, FRAME, pipeline=pipeline):
         counts.append(solver.substeps_made)
         energies.append(energy(now, m, up, floor))
-    solver.check()
     assert np.isfinite(energies).all()
     assert max(energies) < limit * energies[0], int(np.argmax(energies))
     return solver, counts

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import warp as wp
-from newton_scenes import add_grid, builder, contact_parameters, momentum, newton, wc, wn
+from newton_scenes import add_grid, builder, contact_parameters, momentum, newton, stepped, wc, wn
 
 FULL = {"enable_rigid_soft_full_surface_contact": True}
 
@@ -46,16 +46,10 @@ def drop(model, steps, dt=5e-4, each=None, damping=0.0, **options):
     contacts = pipeline.contacts()
     solver = wn.SolverCorotated(model, damping=damping)
     observables = solver.observables({"contact_f"}, contacts=contacts)
-    before, after = model.state(), model.state()
-    for _ in range(steps):
-        before.clear_forces()
-        pipeline.collide(before, contacts)
-        solver.step(before, after, None, contacts, dt, observables=observables)
-        before, after = after, before
+    for state in stepped(solver, model, steps, dt, pipeline=pipeline, contacts=contacts, observables=observables):
         if each is not None:
-            each(before)
-    solver.check()
-    return before, contacts, observables
+            each(state)
+    return state, contacts, observables
 
 
 def weight_of(model):

@@ -73,6 +73,24 @@ def checked_step(solver, before, after, contacts=None, dt=1e-4):
     solver.check()
 
 
+def stepped(solver, model, count, dt, *, pipeline=None, contacts=None, state=None, collides=None, **options):
+    """Make steps from a model's initial state, or another one, each after a search for contacts; yields each result.
+
+    Args:
+        collides, options: Options of ``collide`` and of ``step``.
+    """
+    now, after = model.state() if state is None else state, model.state()
+    contacts = pipeline.contacts() if pipeline is not None and contacts is None else contacts
+    for _ in range(count):
+        now.clear_forces()
+        if pipeline is not None:
+            pipeline.collide(now, contacts, **(collides or {}))
+        solver.step(now, after, None, contacts, dt, **options)
+        now, after = after, now
+        yield now
+    getattr(solver, "check", lambda: None)()
+
+
 def run(solver, model, steps, dt, control=None, pipeline=None, each=None):
     """Make an even number of steps from a model's initial state, two of them recorded and replayed; the last state.
 
@@ -130,6 +148,7 @@ __all__ = [
     "newton",
     "run",
     "semi_implicit",
+    "stepped",
     "wc",
     "wn",
 ]

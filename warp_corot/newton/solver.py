@@ -46,7 +46,8 @@ class SolverCorotated(SolverBase, CouplingInterface):
     out at 0.25 m/s. Soft bodies and cloth collide with one another only on request.
 
     Substeps follow the state: every 64 substeps, two force evaluations find the current stiffness of the elements, and
-    their strains and strain rates tell how soon it may change. All worlds share the substep. On the CPU a step uses
+    their strains and strain rates tell how soon it may change; where shapes may be met, no particle goes farther in a
+    substep than half the smallest element. All worlds share the substep. On the CPU a step uses
     a measurement at once; on CUDA, where it does not wait, a later step does. A recorded step has the substeps that
     it needed when it was recorded, and at least half as many more as at rest; ``check`` warns if these were too few.
 

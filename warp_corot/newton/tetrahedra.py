@@ -14,6 +14,7 @@ from warp_corot.elasticity.cpu import Lanes
 from warp_corot.elasticity.dilatation import ELEMENT
 from warp_corot.elasticity.model import ISOTROPIC, Kept, isotropic_material
 from warp_corot.errors import InputError
+from warp_corot.kernels.distributed.exchange import GATHER, SCATTER
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial, law_functions
 from warp_corot.kernels.elements.elements import GeneralElements
 from warp_corot.kernels.elements.forces import law_stress, repair_forces, scatter_forces
@@ -26,7 +27,6 @@ from warp_corot.kernels.newton.elements import (
     scatter_posed_lanes,
     write_attributes,
 )
-from warp_corot.kernels.newton.particles import add_nodes, gather_nodes
 from warp_corot.mesh import TetForest
 
 from .library import newton
@@ -90,9 +90,10 @@ class ForestGroup:
         if self.follow_one_another:
             self._field.add_forces(self._part_of(u), self._part_of(f))
             return
-        wp.launch(gather_nodes, dim=self.count, inputs=[self._particles, u], outputs=[self._u], device=self.device)
+        for nodal, own in ((u, self._u), (f, self._f)):
+            wp.launch(GATHER[wp.vec4], self.count, [self._particles, nodal, own], device=self.device)
         self._field.add_forces(self._u, self._f)
-        wp.launch(add_nodes, dim=self.count, inputs=[self._particles, self._f], outputs=[f], device=self.device)
+        wp.launch(SCATTER[wp.vec4], self.count, [self._particles, self._f, f], device=self.device)
 
     def _part_of(self, nodal: wp.array) -> wp.array:
         if nodal.ptr not in self._parts:
