@@ -42,6 +42,17 @@ def halfway(p: wp.vec3i, q: wp.vec3i):
 
 
 @wp.func
+def lattice_place(p: wp.vec3i, origin: wp.vec3d, spacing: wp.float64):
+    """Where a lattice point is [m]."""
+    return origin + spacing * wp.vec3d(wp.float64(p[0]), wp.float64(p[1]), wp.float64(p[2]))
+
+
+@wp.func
+def single(a: wp.vec3d):
+    return wp.vec3(float(a[0]), float(a[1]), float(a[2]))
+
+
+@wp.func
 def in_child(w: wp.vec4d, k: int, second: bool):
     """Barycentric coordinates in a child from those in its parent, whose refinement edge is x0-xk.
 

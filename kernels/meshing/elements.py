@@ -7,6 +7,7 @@ import warp as wp
 
 from warp_corot.kernels.tables.shapes import FIRST_NODE, SECOND_NODE
 
+from .bisection import lattice_place, single
 from .growth import VOID, Forest
 
 wp.set_module_options({"enable_backward": False})
@@ -26,12 +27,6 @@ FLATTEST = wp.constant(0.1)
 vec6 = wp.types.vector(length=6, dtype=wp.float32)
 
 
-@wp.func
-def lattice_place(p: wp.vec3i, forest: Forest):
-    """Where a lattice point is [m]."""
-    return forest.origin + forest.spacing * wp.vec3d(wp.float64(p[0]), wp.float64(p[1]), wp.float64(p[2]))
-
-
 @wp.kernel(enable_backward=False)
 def node_points(
     # In
@@ -42,8 +37,7 @@ def node_points(
 ):
     """Positions in float64, with a single rounding."""
     i = wp.tid()
-    x = lattice_place(forest.lattice[first + i], forest)
-    points[i] = wp.vec3(float(x[0]), float(x[1]), float(x[2]))
+    points[i] = single(lattice_place(forest.lattice[first + i], forest.origin, forest.spacing))
 
 
 @wp.kernel(enable_backward=False)
@@ -248,8 +242,8 @@ def judge_by_edges(
         value += 4.0 * place[FIRST_NODE[e]] * place[SECOND_NODE[e]] * deviation[e]
     at = wp.vec3d()
     for n in range(4):
-        at += wp.float64(place[n]) * lattice_place(forest.lattice[tet[n]], forest)
-    probes[i] = wp.vec3(float(at[0]), float(at[1]), float(at[2]))
+        at += wp.float64(place[n]) * lattice_place(forest.lattice[tet[n]], forest.origin, forest.spacing)
+    probes[i] = single(at)
     expected[i] = value
     deviations[i] = worst
 

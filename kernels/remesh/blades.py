@@ -13,6 +13,7 @@ import warp as wp
 
 from warp_corot.kernels.contact.motion import Motions, move_obstacle
 from warp_corot.kernels.elements.elements import load_node
+from warp_corot.kernels.meshing.bisection import single
 from warp_corot.kernels.stepping.pace import DONE, DT, Pace
 
 from .cut_surface import BUNDLE, Surface
@@ -65,11 +66,6 @@ class Edges:
     work: wp.array[wp.float64]  # [blades] done on the tissue [J]
     modulus: wp.array[wp.float32]  # of the leaf that each is in [Pa]
     common: float  # modulus of all leaves that carry none
-
-
-@wp.func
-def single(a: wp.vec3d):
-    return wp.vec3(float(a[0]), float(a[1]), float(a[2]))
 
 
 @wp.func
@@ -202,12 +198,20 @@ def are_apart(low: wp.vec3, high: wp.vec3, other_low: wp.vec3, other_high: wp.ve
 
 
 @wp.func
+def place_at_rest(tet: wp.vec4i, w: wp.vec4, carried: Carried):
+    """The place at rest of a point with these coordinates in a leaf, whose deformation goes on beyond it."""
+    place = wp.vec3d()
+    for n in range(4):
+        place += wp.float64(w[n]) * doubled(load_node(carried.rest, tet[n]))
+    return place
+
+
+@wp.func
 def adopt_point(k: int, pools: Pools, carried: Carried, edges: Edges):
     """Bind a point to its leaf; returns its place at rest."""
     edges.state[k] = OUTSIDE
-    place = wp.vec3d()
     if edges.best[k] < wp.int64(0):
-        return place
+        return wp.vec3d()
     i = int(edges.best[k] & wp.int64(4294967295))
     tet = pools.leaf_tets[i]
     weights = coordinates(edges.x[k], tet, carried)
@@ -220,7 +224,6 @@ def adopt_point(k: int, pools: Pools, carried: Carried, edges: Edges):
     there = wp.vec3()
     for n in range(4):
         there += weights[n] * tissue_place(tet[n], carried)
-        place += wp.float64(weights[n]) * doubled(load_node(carried.rest, tet[n]))
     if wp.length(there - edges.x[k]) > REACH * size:
         state = int(OUTSIDE)
     edges.nodes[k] = tet
@@ -228,7 +231,7 @@ def adopt_point(k: int, pools: Pools, carried: Carried, edges: Edges):
     edges.size[k] = size
     edges.modulus[k] = modulus_of(pools.leaves[i], edges.common, carried)
     edges.state[k] = state
-    return place
+    return place_at_rest(tet, weights, carried)
 
 
 @wp.kernel(enable_backward=False)
@@ -241,16 +244,6 @@ def bind_points(
 ):
     """Bind the points to the leaves in which they are."""
     adopt_point(wp.tid(), pools, carried, edges)
-
-
-@wp.func
-def continued(x: wp.vec3, tet: wp.vec4i, carried: Carried):
-    """The place at rest of a point near a leaf, whose deformation goes on beyond it."""
-    w = coordinates(x, tet, carried)
-    place = wp.vec3d()
-    for n in range(4):
-        place += wp.float64(w[n]) * doubled(load_node(carried.rest, tet[n]))
-    return place
 
 
 @wp.kernel(enable_backward=False)
@@ -280,10 +273,10 @@ def sweep_points(
     if (former != IN_TISSUE or state != IN_TISSUE) and wp.length(end - start) > wp.float64(JUMP * edges.size[k]):
         swept = False
     if not swept and state == IN_TISSUE:
-        start = continued(edges.former[k], edges.nodes[k], carried)
+        start = place_at_rest(edges.nodes[k], coordinates(edges.former[k], edges.nodes[k], carried), carried)
         swept = True
     elif not swept and former == IN_TISSUE:
-        last = continued(edges.x[k], left, carried)
+        last = place_at_rest(left, coordinates(edges.x[k], left, carried), carried)
         swept = True
     edges.former[k] = edges.x[k]
     edges.swept[k] = wp.where(swept and begins == 0, 1, 0)

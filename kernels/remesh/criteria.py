@@ -11,7 +11,7 @@ from warp_corot.kernels.elements.constitutive import corotated_strain, hooke
 from warp_corot.kernels.elements.elements import load_node
 from warp_corot.kernels.elements.forces import von_mises
 from warp_corot.kernels.math.rotation import byers_xu, identity3
-from warp_corot.kernels.meshing.bisection import refinement_end
+from warp_corot.kernels.meshing.bisection import lattice_place, refinement_end, single
 from warp_corot.kernels.modules import unique_kernel
 from warp_corot.kernels.remesh.pools import LEAVES, REFINE, SIMPLIFY, Pools
 
@@ -69,11 +69,7 @@ def load_state(
     tet = pools.tets[e]
     p = pools.lattice[tet[0]]
     state.level = pools.level[e]
-    state.corner = wp.vec3(
-        float(origin[0] + wp.float64(p[0]) * spacing),
-        float(origin[1] + wp.float64(p[1]) * spacing),
-        float(origin[2] + wp.float64(p[2]) * spacing),
-    )
+    state.corner = single(lattice_place(p, origin, spacing))
     size = float(spacing)
     rest = mat43()
     moved = mat43()

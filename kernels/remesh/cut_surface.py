@@ -3,6 +3,7 @@
 import warp as wp
 
 from warp_corot.kernels.elements.elements import load_node
+from warp_corot.kernels.meshing.bisection import lattice_place
 
 from .pools import Carried, Pools, doubled
 
@@ -39,8 +40,7 @@ class Surface:
 @wp.func
 def place_of(node: int, is_deformed: wp.float64, pools: Pools, carried: Carried):
     """Where a node is [m]."""
-    p = pools.lattice[node]
-    place = carried.origin + carried.spacing * wp.vec3d(wp.float64(p[0]), wp.float64(p[1]), wp.float64(p[2]))
+    place = lattice_place(pools.lattice[node], carried.origin, carried.spacing)
     if is_deformed != wp.float64(0.0):
         place += is_deformed * doubled(load_node(carried.u, node))
     return place

@@ -21,6 +21,7 @@ Tetrahedra carry columns of numbers. Children have their parent's values; each c
 import warp as wp
 
 from warp_corot.kernels.elements.elements import load_node, store_node
+from warp_corot.kernels.meshing.bisection import lattice_place, single
 from warp_corot.kernels.plan.plan import SINKS
 
 wp.set_module_options({"enable_backward": False})
@@ -203,6 +204,14 @@ def quarter_mass(e: int, level: int, carried: Carried):
 
 
 @wp.func
+def mass_changes(e: int, child: int, level: int, carried: Carried):
+    """What a tetrahedron gives to each end of its refinement edge more than its two children do, the first end's first
+    [kg]."""
+    whole = quarter_mass(e, level, carried)
+    return whole - quarter_mass(child, level + 1, carried), whole - quarter_mass(child + 1, level + 1, carried)
+
+
+@wp.func
 def modulus_of(e: int, common: float, carried: Carried):
     """2 mu + lambda of a leaf, times its filled fraction [Pa]; what is common to all leaves that carry none."""
     if carried.mu_column < 0:
@@ -255,15 +264,6 @@ def average_children(e: int, child: int, carried: Carried):
 
 
 @wp.func
-def rest_position(point: wp.vec3i, carried: Carried):
-    return wp.vec3(
-        float(carried.origin[0] + wp.float64(point[0]) * carried.spacing),
-        float(carried.origin[1] + wp.float64(point[1]) * carried.spacing),
-        float(carried.origin[2] + wp.float64(point[2]) * carried.spacing),
-    )
-
-
-@wp.func
 def row_between(a: int, b: int):
     """The row of a node between two held nodes with rows a and b."""
     row = wp.where(a == b, a, NO_ROW)
@@ -283,7 +283,7 @@ def make_node(
     carried: Carried,
 ):
     """Make the midpoint of the deformed edge a-b from what both ends lose."""
-    store_node(carried.rest, z, rest_position(point, carried))
+    store_node(carried.rest, z, single(lattice_place(point, carried.origin, carried.spacing)))
     store_node(carried.reaction, z, wp.vec3())
     store_node(carried.u, z, 0.5 * (load_node(carried.u, a) + load_node(carried.u, b)))
     store_node(carried.load, z, wp.vec3())
@@ -299,8 +299,7 @@ def make_node(
     if both_held:
         wp.atomic_add(carried.impulse, 0, mass * doubled(velocity) - momentum)
     elif mass > wp.float64(0.0):
-        mean = momentum / mass
-        velocity = wp.vec3(float(mean[0]), float(mean[1]), float(mean[2]))
+        velocity = single(momentum / mass)
     store_node(carried.v, z, velocity)
     carried.mass[z] = mass
     wp.atomic_add(carried.mass, a, -loss_a)
@@ -393,8 +392,7 @@ def settle_ends(
         if carried.held[end] != wp.uint8(0):
             wp.atomic_add(carried.impulse, 0, -momentum)
         elif mass > wp.float64(0.0):
-            v = doubled(load_node(carried.v, end)) + momentum / mass
-            store_node(carried.v, end, wp.vec3(float(v[0]), float(v[1]), float(v[2])))
+            store_node(carried.v, end, single(doubled(load_node(carried.v, end)) + momentum / mass))
         carried.mass[end] = mass
         carried.gained_mass[end] = wp.float64(0.0)
         carried.gained_momentum[end] = wp.vec3d()

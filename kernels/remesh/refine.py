@@ -34,7 +34,7 @@ from warp_corot.kernels.remesh.pools import (
     Pools,
     copy_to_children,
     make_node,
-    quarter_mass,
+    mass_changes,
 )
 from warp_corot.kernels.tables.shapes import FIRST_NODE, FRAME_SHIFT, SECOND_NODE
 
@@ -432,9 +432,7 @@ def bisect_edge(slot: int, pools: Pools, edges: WantedEdges, carried: Carried):
         level = pools.level[e]
         bisect_leaf(e, child, z, pools, edges)
         copy_to_children(e, child, carried)
-        whole = quarter_mass(e, level, carried)
-        at_first = whole - quarter_mass(child, level + 1, carried)
-        at_second = whole - quarter_mass(child + 1, level + 1, carried)
+        at_first, at_second = mass_changes(e, child, level, carried)
         if pools.tets[e][0] == a:
             loss_a += at_first
             loss_b += at_second

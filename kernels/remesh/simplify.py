@@ -22,7 +22,7 @@ from .pools import (
     Carried,
     Pools,
     average_children,
-    quarter_mass,
+    mass_changes,
     unmake_node,
 )
 
@@ -106,9 +106,7 @@ def remove_node(z: int, pools: Pools, carried: Carried, removal: Removal):
         tet = pools.tets[e]
         end = refinement_end(level)
         average_children(e, child, carried)
-        whole = quarter_mass(e, level, carried)
-        at_first = whole - quarter_mass(child, level + 1, carried)
-        at_second = whole - quarter_mass(child + 1, level + 1, carried)
+        at_first, at_second = mass_changes(e, child, level, carried)
         if tet[0] == ends[0]:
             gain_a += at_first
             gain_b += at_second

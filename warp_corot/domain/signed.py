@@ -15,6 +15,7 @@ from warp_corot.inputs.checks import (
     checked_device,
     checked_length,
     checked_numbers,
+    checked_points,
     checked_strings,
     shown,
 )
@@ -205,13 +206,8 @@ class SignedFunction:
         return []
 
     def _on_device(self, points: npt.ArrayLike) -> wp.array:
-        given = checked_numbers(points, "points", "[n, 3]")
-        if given.ndim != 2 or given.shape[1] != 3:
-            raise InputError(f"points has shape {given.shape}; it must be [n, 3]")
-        bad = np.flatnonzero(~np.isfinite(given).all(axis=1))
-        if len(bad):
-            raise InputError(f"point {bad[0]} is {given[bad[0]].tolist()}; its coordinates must be finite")
-        return wp.array(np.ascontiguousarray(given, dtype=np.float32), dtype=wp.vec3, device=self.device)
+        given = np.ascontiguousarray(checked_points(points), dtype=np.float32)
+        return wp.array(given, dtype=wp.vec3, device=self.device)
 
 
 def _checked_vec3(points: wp.array) -> wp.array:

@@ -67,6 +67,21 @@ def checked_vector(given: npt.ArrayLike, name: str, unit: str = "m") -> npt.NDAr
     return vector
 
 
+def checked_points(points: npt.ArrayLike | wp.array) -> npt.NDArray[np.float64]:
+    """Finite points, float64 [n, 3].
+
+    Raises:
+        InputError: They have another shape, or are not finite.
+    """
+    points = checked_numbers(points, "points", "[n, 3]")
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise InputError(f"points has shape {points.shape}; it must be [n, 3]")
+    bad = np.flatnonzero(~np.isfinite(points).all(axis=1))
+    if len(bad):
+        raise InputError(f"point {bad[0]} is {points[bad[0]].tolist()}; its coordinates must be finite")
+    return points
+
+
 def checked_number(given: Any, name: str, unit: str = "") -> float:
     """One number, which may be infinite or NaN.
 

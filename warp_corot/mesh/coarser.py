@@ -72,12 +72,9 @@ def _uniform(tree: UniformTree, level: int) -> UniformTree:
 
 def _cut(tree: Tree, level: int) -> Tree:
     """The tree without the tetrahedra below a level."""
-    kept = tree.level <= level
-    number = np.cumsum(kept, dtype=np.int32) - 1
-    first_child = np.where(tree.first_child < 0, tree.first_child, number[tree.first_child])
-    lowest = (tree.level == level) & (tree.first_child >= 0)
-    live = np.zeros(len(kept), bool)
+    kept, first_child = np.flatnonzero(tree.level <= level), tree.first_child.copy()
+    lowest = (tree.level == level) & (first_child >= 0)
+    live = np.zeros(len(first_child), bool)
     live[tree.ancestors(tree.leaves, level)] = True
     first_child[lowest] = np.where(live[lowest], LIVE, VOID)
-    parent = np.where(tree.parent < 0, np.int32(-1), number[tree.parent])
-    return Tree(tree.tets[kept], tree.level[kept], parent[kept], first_child[kept].astype(np.int32))
+    return Tree(tree.tets, tree.level, tree.parent, first_child).taken(kept)

@@ -16,7 +16,7 @@ import numpy.typing as npt
 import warp as wp
 
 from warp_corot.errors import InputError
-from warp_corot.inputs.checks import checked_indices, shown
+from warp_corot.inputs.checks import checked_count, checked_indices, shown
 
 from .forest_arrays import ForestArrays
 from .lattice import LATTICE_BITS, checked_box
@@ -24,7 +24,7 @@ from .lattice import MAX_LEVEL as MAX_LEVEL
 from .surfaces.bodies import largest_piece, separating_surface, summary, surface
 from .surfaces.bound import SurfaceMesh, embed
 from .topology import pieces_of
-from .tree import VOID, Tree, UniformTree, renumbered, with_virtual
+from .tree import VOID, Tree, UniformTree, at_midpoints, renumbered, with_virtual
 from .uniform import halvings, uniform_leaves
 
 if TYPE_CHECKING:
@@ -149,26 +149,14 @@ class TetForest(ForestArrays):
             UserWarning: The mesh leaves out tips of the body that no face of an element joins to the rest.
         """
         from warp_corot.domain import Domain
-        from warp_corot.mesh.growing.from_domain import mesh_domain
+        from warp_corot.mesh.growing.from_domain import Budget, checked_wishes, mesh_domain
 
         if not isinstance(domain, Domain):
             cure = f"Domain.from_surface({str(domain)!r}) makes one" if isinstance(domain, str | PathLike) else ""
             raise InputError(f"domain is {shown(domain)}; it must be a Domain{cure and ': ' + cure}")
-        return mesh_domain(
-            domain,
-            cell_size,
-            max_level,
-            surface_error,
-            min_level,
-            refine_where,
-            field,
-            field_tolerance,
-            target_elements,
-            min_layers,
-            detail,
-            sliver,
-            device,
-        )
+        wishes = checked_wishes(max_level, surface_error, min_level, refine_where, field, field_tolerance)
+        target = 0 if target_elements is None else checked_count(target_elements, "target_elements", 1)
+        return mesh_domain(domain, Budget(target, cell_size, max_level, min_layers, wishes), detail, sliver, device)
 
     def refine(self, leaves: npt.ArrayLike) -> TetForest:
         """A forest in which the chosen leaves are bisected, and as many others as conformity needs.
@@ -240,13 +228,15 @@ def refined(forest: TetForest, leaves: np.ndarray) -> TetForest:
     order = with_virtual(real, grown, lattice)
     new_ends, new_tree = renumbered(order, ends, grown)
     whose = _leaves_before(forest.tree, grown)
+    known = np.where(np.arange(len(lattice)) < len(forest.lattice), np.arange(len(lattice)), -1)
+    labels = at_midpoints(forest.node_labels, known, ends, first=True)
     return replace(
         forest,
         lattice=lattice[order],
         node_ends=new_ends,
         tree=new_tree,
-        phi=None if forest.phi is None else _interpolated(forest.phi, ends)[order],
-        node_labels=None if forest.node_labels is None else _first_ends(forest.node_labels, ends)[order],
+        phi=None if forest.phi is None else at_midpoints(forest.phi, known, ends)[order],
+        node_labels=None if labels is None else labels[order],
         fill=None if forest.fill is None else forest.fill[whose],
         labels=None if forest.labels is None else forest.labels[whose],
     )
@@ -260,20 +250,3 @@ def _leaves_before(before: Tree, after: Tree) -> np.ndarray:
     number = np.full(len(before.level), -1, np.int32)
     number[before.leaves] = np.arange(len(before.leaves), dtype=np.int32)
     return number[found]
-
-
-def _interpolated(values: np.ndarray, ends: np.ndarray) -> np.ndarray:
-    """Values of the first nodes, and at every later one the mean of its two ends."""
-    found = np.full(len(ends), np.nan, values.dtype)
-    found[: len(values)] = values
-    while len(missing := np.flatnonzero(np.isnan(found))):
-        found[missing] = found[ends[missing]].mean(axis=1)
-    return found
-
-
-def _first_ends(values: np.ndarray, ends: np.ndarray) -> np.ndarray:
-    """Values of the first nodes, and at every later one that of the end with the lower number."""
-    origin = np.arange(len(ends))
-    while (new := origin >= len(values)).any():
-        origin[new] = ends[origin[new], 0]
-    return values[origin]

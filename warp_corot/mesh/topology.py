@@ -67,6 +67,13 @@ def signed_volumes(points: ArrayLike, tets: ArrayLike) -> NDArray[np.float64]:
     return np.einsum("ij,ij->i", a, np.cross(b, c)) / 6.0
 
 
+def coordinates_in(corners: np.ndarray, points: np.ndarray) -> NDArray[np.float64]:
+    """Barycentric coordinates of points [n, 3] in tetrahedra [n, 4, 3], float64 [n, 4]; some are negative outside."""
+    edges = np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2)
+    later = np.linalg.solve(edges, (points - corners[:, 0])[..., None])[..., 0]
+    return np.column_stack([1.0 - later.sum(axis=1), later])
+
+
 def boundary_faces(tets: ArrayLike, points: ArrayLike | None = None) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
     """Faces that belong to exactly one tetrahedron, wound counter-clockwise seen from outside.
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -34,11 +35,16 @@ class Tree:
     cut: np.ndarray | None = None
 
     @cached_property
-    def leaves(self) -> np.ndarray:
-        """Live leaves in tree order (each subtree's leaves side by side, first child first), int32 [T]."""
+    def inner_by_level(self) -> list[np.ndarray]:
+        """Tetrahedra with children, level by level."""
         inner = np.flatnonzero(self.first_child >= 0)
         inner = inner[np.argsort(self.level[inner], kind="stable")]
-        by_level = np.split(inner, np.cumsum(np.bincount(self.level[inner])))
+        return np.split(inner, np.cumsum(np.bincount(self.level[inner], minlength=1))[:-1])
+
+    @cached_property
+    def leaves(self) -> np.ndarray:
+        """Live leaves in tree order (each subtree's leaves side by side, first child first), int32 [T]."""
+        by_level = self.inner_by_level
         # The number of leaves below each element, from the bottom up; then the place of the first of them.
         count = (self.first_child == LIVE).astype(np.int32)
         for elements in reversed(by_level):
@@ -65,6 +71,15 @@ class Tree:
     def leaf_levels(self) -> np.ndarray:
         """Level of each leaf, int32 [T]."""
         return self.level[self.leaves]
+
+    def taken(self, order: np.ndarray) -> Tree:
+        """The tree of some tetrahedra, of which none is without its parent or one of two children, in another order."""
+        number = np.full(len(self.level), -1, np.int32)
+        number[order] = np.arange(len(order), dtype=np.int32)
+        parent, child = self.parent[order], self.first_child[order]
+        parent = np.where(parent < 0, np.int32(-1), number[parent])
+        child = np.where(child < 0, child, number[child]).astype(np.int32)
+        return Tree(self.tets[order], self.level[order], parent, child, None if self.cut is None else self.cut[order])
 
     def rows(self, elements: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Nodes, int32 [n, 4], and levels, int32 [n], of the elements with these indices."""
@@ -174,6 +189,28 @@ class UniformTree(Tree):
         return int(first) if first == last else None
 
 
+def at_midpoints(values: np.ndarray | None, known: np.ndarray, ends: np.ndarray, *, first: bool = False) -> Any:
+    """Values of nodes; those that are not known are the mean of both ends of the edge whose midpoint a node is.
+
+    Args:
+        values: Known values; None: there are none.
+        known: The place of each node among them, -1 if it is not known [N].
+        ends: The ends of each node's edge [N, 2].
+        first: Take the first end's value, not the mean.
+    """
+    if values is None:
+        return None
+    found = np.zeros(len(known), values.dtype)
+    there = known >= 0
+    found[there] = values[known[there]]
+    while not there.all():
+        next_ones = np.flatnonzero(~there & there[ends].all(axis=1))
+        at_ends = found[ends[next_ones]]
+        found[next_ones] = at_ends[:, 0] if first else at_ends.mean(axis=1)
+        there[next_ones] = True
+    return found
+
+
 def in_order_of_leaves(tree: Tree) -> np.ndarray:
     """Nodes that live leaves name, in the order in which they first name them: neighbours stay neighbours."""
     touched = tree.leaf_tets.ravel()
@@ -214,8 +251,7 @@ def pruned(tree: Tree, empty: np.ndarray) -> tuple[Tree, np.ndarray]:
         The tree, and the old tetrahedra that are in it, ascending.
     """
     first_child, empty = tree.first_child.copy(), empty.copy()
-    inner = np.flatnonzero(first_child >= 0)
-    by_level = np.split(inner[np.argsort(tree.level[inner], kind="stable")], np.cumsum(np.bincount(tree.level[inner])))
+    by_level = tree.inner_by_level
     for elements in reversed(by_level):
         child = first_child[elements]
         hollow = elements[empty[child] & empty[child + 1]]
@@ -227,11 +263,7 @@ def pruned(tree: Tree, empty: np.ndarray) -> tuple[Tree, np.ndarray]:
         child = tree.first_child[gone]
         kept[child] = kept[child + 1] = False
     stays = np.flatnonzero(kept)
-    number = np.cumsum(kept, dtype=np.int32) - 1
-    parent, child = tree.parent[stays], first_child[stays]
-    parent = np.where(parent < 0, np.int32(-1), number[parent])
-    child = np.where(child < 0, child, number[child])
-    return Tree(tree.tets[stays], tree.level[stays], parent, child), stays
+    return Tree(tree.tets, tree.level, tree.parent, first_child).taken(stays), stays
 
 
 def by_levels(tree: Tree) -> Tree:
@@ -240,12 +272,7 @@ def by_levels(tree: Tree) -> Tree:
     while len(inner := rows[-1][tree.first_child[rows[-1]] >= 0]):
         first = tree.first_child[inner]
         rows.append(np.stack([first, first + 1], axis=1).ravel())
-    order = np.concatenate(rows)
-    place = np.empty(len(order), np.int32)
-    place[order] = np.arange(len(order), dtype=np.int32)
-    parent, child = tree.parent[order], tree.first_child[order]
-    parent, child = (np.where(each < 0, each, place[np.maximum(each, 0)]) for each in (parent, child))
-    return Tree(tree.tets[order], tree.level[order], parent, child)
+    return tree.taken(np.concatenate(rows))
 
 
 def live_or_void(tree: Tree, live: np.ndarray) -> Tree:

@@ -20,7 +20,7 @@ from warp_corot.kernels.remesh import pools as kernels
 from warp_corot.kernels.remesh.pools import NO_ROW, SINKS, Carried
 from warp_corot.kernels.tables.shapes import FRAME_SHIFT
 from warp_corot.mesh import TetForest
-from warp_corot.mesh.tree import LIVE, VOID, Tree, renumbered
+from warp_corot.mesh.tree import LIVE, VOID, Tree, at_midpoints, renumbered
 
 #: Arrays of ``kernels.remesh.pools.Pools``, without those that have no meaning after a pass.
 OF_NODES: tuple[str, ...] = ("lattice", "ends", "valence")
@@ -187,8 +187,8 @@ def exported(device: DeviceForest) -> TetForest:
         lattice=lattice,
         node_ends=new_ends,
         tree=new_tree,
-        phi=None if source.phi is None else _from_ends(source.phi, known, new_ends, first=False),
-        node_labels=None if source.node_labels is None else _from_ends(source.node_labels, known, new_ends, first=True),
+        phi=at_midpoints(source.phi, known, new_ends),
+        node_labels=at_midpoints(source.node_labels, known, new_ends, first=True),
         snap=None if tree.cut is None else carriage.arrays.snap.numpy()[order, :3],
         fill=None if source.fill is None else carriage.values("fill")[leaves].astype(np.float64),
         labels=None if source.labels is None else carriage.arrays.label.numpy()[leaves],
@@ -219,19 +219,6 @@ def _same_points(points: np.ndarray, among: np.ndarray) -> np.ndarray:
     number = number.ravel()
     place[number[: len(among)][::-1]] = np.arange(len(among))[::-1]
     return place[number[len(among) :]]
-
-
-def _from_ends(values: np.ndarray, known: np.ndarray, ends: np.ndarray, *, first: bool) -> np.ndarray:
-    """Values at known points; elsewhere the mean of both ends, or the first end's value."""
-    found = np.zeros(len(known), values.dtype)
-    there = known >= 0
-    found[there] = values[known[there]]
-    while not there.all():
-        next_ones = np.flatnonzero(~there & there[ends].all(axis=1))
-        at_ends = found[ends[next_ones]]
-        found[next_ones] = at_ends[:, 0] if first else at_ends.mean(axis=1)
-        there[next_ones] = True
-    return found
 
 
 class PassCounts(NamedTuple):
@@ -361,15 +348,11 @@ class DeviceForest:
     def tree(self) -> tuple[Tree, npt.NDArray[np.intp]]:
         """The tree without unused places, its nodes by their places in the pool; and where its tetrahedra stand."""
         pools = self.pools
-        level = pools.level.numpy()
-        used = np.flatnonzero(level != kernels.UNUSED)
-        number = np.full(len(level), -1, np.int32)
-        number[used] = np.arange(len(used), dtype=np.int32)
-        parent, child = pools.parent.numpy()[used], pools.first_child.numpy()[used]
-        parent = np.where(parent < 0, np.int32(-1), number[parent])
-        child = np.where(child < 0, child, number[child])
-        cut = pools.cut.numpy()[used]
-        return Tree(pools.tets.numpy()[used], level[used], parent, child, cut if cut.any() else None), used
+        arrays = (getattr(pools, name).numpy() for name in ("tets", "level", "parent", "first_child", "cut"))
+        whole = Tree(*arrays)
+        used = np.flatnonzero(whole.level != kernels.UNUSED)
+        tree = whole.taken(used)
+        return tree if tree.cut is not None and tree.cut.any() else replace(tree, cut=None), used
 
     def to_forest(self) -> TetForest:
         """The present mesh on the host, its leaves as here in tree order.

@@ -16,6 +16,7 @@ from warp_corot.kernels.remesh.pools import MEAN, NO_ROW, SINKS, Carried, Pools
 from warp_corot.mesh import TetForest
 from warp_corot.mesh.lattice import MAX_LEVEL, lattice_spacing, volume_shares
 from warp_corot.mesh.surfaces.bound import BoundPoints, DeviceBinding
+from warp_corot.mesh.topology import coordinates_in
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,17 +174,10 @@ class FollowingBinding(DeviceBinding):
         inward = (1.0 - INWARD) * inward / inward.sum(axis=1, keepdims=True) + INWARD / 4.0
         inside = np.einsum("vn,vnc->vc", inward, mesh.points[mesh.tets[leaves]])
         self._roots = wp.array(roots, dtype=wp.int32, device=device)
-        self._inside = wp.array(_coordinates(corners, inside), dtype=wp.vec4d, device=device)
-        self._points = wp.array(_coordinates(corners, bound.points), dtype=wp.vec4d, device=device)
+        self._inside = wp.array(coordinates_in(corners, inside), dtype=wp.vec4d, device=device)
+        self._points = wp.array(coordinates_in(corners, bound.points), dtype=wp.vec4d, device=device)
 
     def rebind(self, pools: Pools) -> None:
         """Bind the points to the present leaves of ``kernels.remesh.pools.Pools``."""
         inputs = [self._roots, self._inside, self._points, pools]
         wp.launch(bind_points, len(self.rest), inputs, [self.nodes, self.weights], device=self.device)
-
-
-def _coordinates(corners: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Barycentric coordinates, float64 [n, 4], of points [n, 3] in tetrahedra [n, 4, 3]."""
-    edges = np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2)
-    later = np.linalg.solve(edges, (points - corners[:, 0])[..., None])[..., 0]
-    return np.column_stack([1 - later.sum(axis=1), later])

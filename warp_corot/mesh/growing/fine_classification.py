@@ -19,7 +19,7 @@ from warp_corot.mesh.bisection import far_end
 from warp_corot.mesh.growing.refinement_criteria import FARTHER, GAP_ELEMENTS, ROUGH, surface_points
 from warp_corot.mesh.lattice import lattice_spacing, volume_shares
 from warp_corot.mesh.scattered import spread_over_eighths
-from warp_corot.mesh.topology import codes, connected
+from warp_corot.mesh.topology import codes, connected, coordinates_in
 from warp_corot.mesh.tree import LIVE, VOID, Tree
 
 if TYPE_CHECKING:
@@ -125,15 +125,13 @@ def wall_shares(corners: np.ndarray, points: np.ndarray, sampled: np.ndarray, do
         sampled: The share of random points in each that are inside [n].
         domain: The body.
     """
-    edges = np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2)
-    volumes = np.abs(np.linalg.det(edges)) / 6.0
+    volumes = np.abs(np.linalg.det(corners[:, 1:] - corners[:, :1])) / 6.0
     lengths = np.cbrt(6.0 * volumes)
     value = domain.sampled(points)
     apart = np.clip(APART * np.abs(value), LEAST_APART * lengths, MOST_APART * lengths)
     normal = domain.normals(points, apart)
     at = points - value[:, None] * normal
-    later = np.linalg.solve(edges, (at - corners[:, 0])[:, :, None])[:, :, 0]
-    within = np.minimum(later.min(axis=1), 1.0 - later.sum(axis=1)) > OUTSIDE
+    within = coordinates_in(corners, at).min(axis=1) > OUTSIDE
     crossed = np.flatnonzero(within & (np.abs(domain.sampled(at)) < OFF * lengths))
     reach = THICKEST * float(lengths[crossed].max(initial=0.0))
     if not reach:
@@ -183,10 +181,7 @@ class Resolved:
         tree = grown.tree
         self.grown = grown
         self.cell_size = cell_size
-        inner = np.flatnonzero(tree.first_child >= 0)
-        inner = inner[np.argsort(tree.level[inner], kind="stable")]
-        counts = np.bincount(tree.level[inner]) if len(inner) else np.zeros(1, int)
-        self._by_level = np.split(inner, np.cumsum(counts)[:-1])
+        self._by_level = tree.inner_by_level
         leaves = np.flatnonzero(tree.first_child == LIVE)
         shares = inside_shares(grown.phi[tree.tets[leaves]])
         self.volume = volume_shares(tree.level)
@@ -250,14 +245,8 @@ class Resolved:
 
     def tree_of(self, child: np.ndarray) -> tuple[Tree, np.ndarray]:
         """A mesh in the forest as a separate tree, and its tetrahedra's numbers in the forest, ascending."""
-        tree = self.grown.tree
-        there = child != BELOW
-        number = np.cumsum(there, dtype=np.int32) - 1
-        stays = np.flatnonzero(there)
-        parent, first = tree.parent[stays], child[stays]
-        parent = np.where(parent < 0, np.int32(-1), number[parent])
-        first = np.where(first < 0, first, number[np.maximum(first, 0)]).astype(np.int32)
-        return Tree(tree.tets[stays], tree.level[stays], parent, first), stays
+        tree, stays = self.grown.tree, np.flatnonzero(child != BELOW)
+        return Tree(tree.tets, tree.level, tree.parent, child).taken(stays), stays
 
     def as_wished(self) -> np.ndarray:
         """The mesh before the body was sampled more finely, as its first children [M]."""

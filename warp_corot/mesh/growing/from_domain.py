@@ -17,7 +17,7 @@ import numpy as np
 import warp as wp
 
 from warp_corot.errors import InputError
-from warp_corot.inputs.checks import checked_count, checked_device, checked_number, shown
+from warp_corot.inputs.checks import checked_device, checked_number, shown
 from warp_corot.inputs.loading import MESHING, load
 from warp_corot.mesh.forest import TetForest
 from warp_corot.mesh.growing.fine_classification import Coarsening, Resolved
@@ -84,7 +84,7 @@ class Budget:
     """The limits of a mesh with a given number of elements.
 
     Attributes:
-        target: The largest number of elements.
+        target: The largest number of elements; 0: as many as the wishes ask for.
         cell_size: Edge of a cube [m]; None: chosen.
         max_level: The largest level; None: chosen.
         min_layers: Number of elements through the thickness, if the total number allows.
@@ -305,39 +305,25 @@ CLOSER_ELEMENTS = 4_000_000
 
 
 def mesh_domain(
-    domain: Domain,
-    cell_size: float | None,
-    max_level: int | None,
-    surface_error: float | None,
-    min_level: int,
-    refine_where: Field | None,
-    field: Field | None,
-    field_tolerance: float,
-    target_elements: int | None,
-    min_layers: float,
-    detail: int,
-    sliver: float,
-    device: str | wp.Device | None,
+    domain: Domain, budget: Budget, detail: int, sliver: float, device: str | wp.Device | None
 ) -> TetForest:
     """See `TetForest.from_domain`."""
     where = checked_device(domain.device if device is None else device)
     load(MESHING, where)
-    _check(cell_size, target_elements, min_layers, detail, sliver)
-    wishes = checked_wishes(max_level, surface_error, min_level, refine_where, field, field_tolerance)
-    if target_elements is not None:
-        size = None if cell_size is None else float(cell_size)
-        _check_cubes(domain, size, target_elements)
-        budget = Budget(target_elements, size, max_level, float(min_layers), wishes)
-        return _of_size(domain, budget, sliver, where)
+    _check(budget, detail, sliver)
+    cell_size, wishes = None if budget.cell_size is None else float(budget.cell_size), budget.wishes
+    if budget.target:
+        _check_cubes(domain, cell_size, budget.target)
+        return _of_size(domain, replace(budget, cell_size=cell_size), sliver, where)
     if cell_size is None:
         raise InputError("cell_size is None; it must be a length in metres where target_elements is not given")
-    growing = Growing(domain, float(cell_size), wishes, where)
+    growing = Growing(domain, cell_size, wishes, where)
     growing.run()
     wished = growing.growth.first_child[: growing.growth.element_count].numpy().copy()
     if detail:
         growing.look_closer(detail, CLOSER_ERROR, CLOSER_ELEMENTS)
     grown = growing.grown(wished)
-    resolved = Resolved(grown, float(cell_size), domain if detail else None)
+    resolved = Resolved(grown, cell_size, domain if detail else None)
     forest, left_out = _finished(resolved, resolved.as_wished(), domain, sliver)
     _say(left_out)
     if not detail:
@@ -371,16 +357,14 @@ def _of_size(domain: Domain, budget: Budget, sliver: float, device: wp.Device) -
     return replace(best, detail=_detail(meshes.resolved, meshes.surface(threshold), domain))
 
 
-def _check(cell_size: Any, target: Any, min_layers: Any, detail: Any, sliver: Any) -> None:
-    if cell_size is not None:
-        checked_cell_size(cell_size)
+def _check(budget: Budget, detail: Any, sliver: Any) -> None:
+    if budget.cell_size is not None:
+        checked_cell_size(budget.cell_size)
     checked_level(detail, "detail")
-    if not 0 <= checked_number(min_layers, "min_layers") < np.inf:
-        raise InputError(f"min_layers is {min_layers}; it must be a number of elements, 0 for no care")
-    if target is not None:
-        checked_count(target, "target_elements", 1)
-        if target > MOST_ELEMENTS:
-            raise InputError(f"target_elements is {target}; it must be at most {MOST_ELEMENTS}")
+    if not 0 <= checked_number(budget.min_layers, "min_layers") < np.inf:
+        raise InputError(f"min_layers is {budget.min_layers}; it must be a number of elements, 0 for no care")
+    if budget.target > MOST_ELEMENTS:
+        raise InputError(f"target_elements is {budget.target}; it must be at most {MOST_ELEMENTS}")
     if not 0 <= checked_number(sliver, "sliver") < 1:
         raise InputError(f"sliver is {sliver}; it must be a share of an element's volume, from 0 to below 1")
 

@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from warp_corot.mesh.scattered import combined, weights_within
+from warp_corot.mesh.topology import coordinates_in
 
 from .fine_classification import LEAST, MOST_POINTS, Resolved, label_shares
 
@@ -239,8 +240,6 @@ def _at(forest: ForestArrays, point: np.ndarray, growers: Growers) -> tuple[floa
     elements = np.flatnonzero(near)
     if not len(elements):
         return -np.inf, 0
-    x = corners[elements]
-    later = np.linalg.solve(np.swapaxes(x[:, 1:] - x[:, :1], 1, 2), (point - x[:, 0])[..., None])[..., 0]
-    depth = np.minimum(later.min(axis=1), 1.0 - later.sum(axis=1))
+    depth = coordinates_in(corners[elements], point).min(axis=1)
     best = int(np.argmax(depth))
     return float(depth[best]), int(elements[best])

@@ -13,11 +13,11 @@ import numpy.typing as npt
 import warp as wp
 
 from warp_corot.errors import InputError
-from warp_corot.inputs.checks import checked_indices, checked_numbers
+from warp_corot.inputs.checks import checked_indices, checked_numbers, checked_points
 from warp_corot.kernels.meshing import embedding as kernels
 from warp_corot.kernels.meshing.embedding import find_holders
 from warp_corot.kernels.meshing.windings import find_nearest
-from warp_corot.mesh.topology import boundary_faces
+from warp_corot.mesh.topology import boundary_faces, coordinates_in
 from warp_corot.mesh.tree import Tree
 
 if TYPE_CHECKING:
@@ -25,21 +25,6 @@ if TYPE_CHECKING:
 
 #: Points farther away than this many lengths of the mesh are moved to that distance; float32 cannot resolve more.
 FARTHEST = 1.0e3
-
-
-def checked_points(points: npt.ArrayLike) -> np.ndarray:
-    """Points float64 [n, 3].
-
-    Raises:
-        InputError: They have another shape, or are not finite.
-    """
-    points = checked_numbers(points, "points", "[n, 3]")
-    if points.ndim != 2 or points.shape[1] != 3:
-        raise InputError(f"points has shape {points.shape}; it must be [n, 3]")
-    bad = np.flatnonzero(~np.isfinite(points).all(axis=1))
-    if len(bad):
-        raise InputError(f"point {bad[0]} is {points[bad[0]].tolist()}; its coordinates must be finite")
-    return points
 
 
 def embed_in_tets(nodes: np.ndarray, tets: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -140,10 +125,7 @@ def embed(forest: ForestArrays, points: npt.ArrayLike) -> tuple[np.ndarray, np.n
 
 def barycentric(forest: ForestArrays, elements: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Barycentric coordinates of points in leaves, float64 [n, 4]; some are negative for points outside."""
-    x = forest.points[forest.tets[elements]]
-    edges = np.swapaxes(x[:, 1:] - x[:, :1], 1, 2)
-    later = np.linalg.solve(edges, (points - x[:, 0])[..., None])[..., 0]
-    return np.column_stack([1 - later.sum(axis=1), later])
+    return coordinates_in(forest.points[forest.tets[elements]], points)
 
 
 def leaves_at(
