@@ -21,7 +21,7 @@ COROT_INLINE void scatter_groups(Law law, const Units& units, int block, int cou
         gradient_of(at, u, gradients[eight]);
         store8(thetas + 8 * eight, Of::theta(gradients[eight], at.frame));
     }
-    const auto lambda_of = [&](int element) { return material.lam.data[material.isotropic.stride * element]; };
+    const auto lambda_of = [&](int t) { return material.lam.data[material.isotropic.stride * units.numbers.data[t]]; };
     for (int group = first_group; group < last_group; ++group) {
         float sum = 0.0f, weight = 0.0f;
         for (int t = starts[group]; t < starts[group + 1]; ++t) {
