@@ -80,7 +80,8 @@ class LawField(ElementField):
 
     def follow(self) -> None:
         super().follow()
-        self._batches, self._clusters = [], None
+        self._batches: list[Batch] = []
+        self._clusters: ClusterScatter | None = None
         if self._simd is None:
             self._batches, self._clusters = divided(self.discretization, self.plan, isotropic_law(self._law.stress))
         self._kernels = [self._kernel(batch.shape, batch.grouped) for batch in self._batches]
