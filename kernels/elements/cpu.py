@@ -67,7 +67,7 @@ GROUPS = 4
 
 @wp.struct
 class GroupedMaterial:
-    """Elements group after group, and their material, whose lambda the groups share: ``isotropic`` has none."""
+    """A material whose lambda groups of elements share, and the groups: ``isotropic`` has no lambda."""
 
     isotropic: IsotropicMaterial
     lam: wp.array[wp.float32]
@@ -88,32 +88,23 @@ def scatter_grouped_elements(law: IsotropicLaw, of: Dilatation) -> wp.Kernel:
 
 @functools.cache
 def order_elements(Elements: type) -> wp.Kernel:
-    """Puts elements in the order of their groups."""
+    """Puts elements in the order of their groups, which is that of their numbers."""
 
     @unique_kernel()
     def order_elements(
         # In
         elements: Elements,
-        material: IsotropicMaterial,
-        lam: wp.array[wp.float32],
-        members: wp.array[wp.int32],
+        starts: wp.array[wp.int32],
         live: wp.array[wp.int32],
         # In and out
         general: GeneralElements,
-        grouped: GroupedMaterial,
     ):
         k = wp.tid()
-        last = members.shape[0]
-        if live.shape[0] > 0:
-            last = grouped.starts[live[0]]
-        if k >= last:
+        if live.shape[0] > 0 and k >= starts[live[0]]:
             return
-        t = members[k]
+        t = general.numbers[k]
         general.nodes[k] = elements.nodes[t]
         general.rest_inverse[k] = rest_inverse_of(elements, t, wp.transpose(frame(elements, t)))
         general.volume[k] = rest_volume(elements, t)
-        if material.stride > 0:
-            grouped.isotropic.mu[k] = material.mu[t]
-            grouped.lam[k] = lam[t]
 
     return order_elements

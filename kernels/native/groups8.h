@@ -15,19 +15,18 @@ COROT_INLINE void scatter_groups(Law law, const Units& units, int block, int cou
     const int* starts = material.starts.data;
     const int begin = starts[first_group], stop = starts[last_group];
     triple<lanes8> gradients[GROUPS * MOST / 8 + 1][3];
-    float thetas[GROUPS * MOST + 8], pressures[GROUPS * MOST + 8];
+    float thetas[GROUPS * MOST + 8], shares[GROUPS * MOST + 8], pressures[GROUPS * MOST + 8];
     for (int first = begin, eight = 0; first < stop; first += 8, ++eight) {
         const GeneralEight<Units> at(units, first, stop);
         gradient_of(at, u, gradients[eight]);
         store8(thetas + 8 * eight, Of::theta(gradients[eight], at.frame));
+        store8(shares + 8 * eight, at.volume * at.value(material.lam, material.isotropic.stride));
     }
-    const auto lambda_of = [&](int element) { return material.lam.data[material.isotropic.stride * element]; };
     for (int group = first_group; group < last_group; ++group) {
         float sum = 0.0f, weight = 0.0f;
         for (int t = starts[group]; t < starts[group + 1]; ++t) {
-            const float share = lambda_of(t) * units.volume.data[t];
-            sum += share * thetas[t - begin];
-            weight += share;
+            sum += shares[t - begin] * thetas[t - begin];
+            weight += shares[t - begin];
         }
         const lanes8 slope = Of::pressure(spread<lanes8>(weight != 0.0f ? sum / weight : 0.0f));
         for (int t = starts[group]; t < starts[group + 1]; ++t) pressures[t - begin] = slope[0];
@@ -38,8 +37,7 @@ COROT_INLINE void scatter_groups(Law law, const Units& units, int block, int cou
         triple<lanes8> p[3], force[4];
         law.begin(at);
         const masks8 valid = law.stress(d, at, p);
-        const lanes8 weight = at.weight() * at.value(material.lam, material.isotropic.stride);
-        add_pressure<Of>(d, load8(thetas + 8 * eight), load8(pressures + 8 * eight), weight, p);
+        add_pressure<Of>(d, load8(thetas + 8 * eight), load8(pressures + 8 * eight), -load8(shares + 8 * eight), p);
         at.forces_of(p, force);
         at.add_forces(force, f);
         at.list_invalid(valid, missed);

@@ -237,6 +237,10 @@ def robust_own_stress(elements: Any, t: int, material: IsotropicMaterial, u: wp.
     return q * stress_out_of_line(w, m, k)
 
 
+@wp.func_native("return wp::index(nodes, t)[n];")
+def node_of(nodes: wp.array[wp.vec4i], t: int, n: int) -> int: ...
+
+
 @wp.func
 def root_rotation(elements: ForestElements, places: wp.array2d[wp.vec2i], first: int, code: int, u: wp.array[wp.vec4]):
     """The rotation of a subtree as one element of a shape code; ``places`` has the leaf and the node of each of its
@@ -244,7 +248,7 @@ def root_rotation(elements: ForestElements, places: wp.array2d[wp.vec2i], first:
     nodes = wp.vec4i(0)
     for n in range(4):
         place = places[shape_of(code), n]
-        nodes[n] = elements.nodes[first + place[0]][place[1]]
+        nodes[n] = node_of(elements.nodes, first + place[0], place[1])
     u0, u1, u2, u3 = node_displacements(nodes, u)
     q = elements.frames[code >> FRAME_SHIFT]
     return rotation_out_of_line(q + gradient_of_code(elements, code, u0, u1, u2, u3)) * wp.transpose(q)

@@ -16,7 +16,7 @@ from warp_corot.discretization.discretization import FixedMesh, deviatoric
 from warp_corot.elasticity import ForceField
 from warp_corot.elasticity.corotated.fields import SubtreeField
 from warp_corot.elasticity.dilatation import DilatationField
-from warp_corot.elasticity.laws import LawCudaField
+from warp_corot.elasticity.laws import LawField
 
 YOUNG, POISSON = 1e4, 0.4
 MODELS = {
@@ -200,7 +200,7 @@ def test_one_launch_gives_the_forces_of_several_passes(law, device, rng, monkeyp
     u = vec4(rng.uniform(-0.02, 0.02, mesh.points.shape), device)
     together = nodal(MODELS[law](dilatation="shared").bind(body).elastic_forces(u))
     monkeypatch.setattr(ForceField, "share_dilatation", lambda *_: False)
-    for kind in (SubtreeField, LawCudaField):
+    for kind in (SubtreeField, LawField):
         monkeypatch.setattr(kind, "in_clusters", None)
     apart = nodal(MODELS[law](dilatation="shared").bind(body).elastic_forces(u))
     assert np.abs(together - apart).max() < 2e-5 * np.abs(apart).max()

@@ -75,7 +75,7 @@ class AddedForces:
 
 
 @forwards("law", "shares_dilatation", "find_members", "rotation_level", "elapsed", "complete_step", "relax_fully")
-@forwards("law", "state", "reset", "load_kernels", "note", "derive", "take_material", "follow")
+@forwards("law", "state", "reset", "load_kernels", "note", "derive", "follow")
 class AddedStressField(ForceField):
     """The forces of a law and of an additional stress in all elements.
 

@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 import warp as wp
 
-from warp_corot.discretization.elements import Elements, copied
+from warp_corot.discretization.elements import Elements
 from warp_corot.discretization.plan import Plan, Sharing
 from warp_corot.discretization.planner import places_on
 from warp_corot.elasticity.divided import Piece
-from warp_corot.elasticity.model import ROTATED, Kept, isotropic_material
+from warp_corot.elasticity.model import ROTATED, Kept
 from warp_corot.inputs.cpu_threads import Team, launch, part_of
 from warp_corot.inputs.loading import LoadedKernel, load
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial, RotatedMaterial
@@ -121,13 +121,12 @@ class Dilating:
         self._lam, self._plan, self._order = lam, plan, order_elements(kind)
         self._of_subtrees = Kept(DilatingMaterial, "isotropic", "lam", "tolerance")
         load(["elements.cpu"], wp.get_device("cpu"), [self._order])
-        self._members, self._live, most = members, live, len(members)
+        self._starts, self._live, most = starts, live, len(members)
         general = self._general = GeneralElements()
         general.nodes = general.targets = wp.zeros(most, dtype=wp.vec4i, device="cpu")
         general.rest_inverse = wp.zeros(most, dtype=wp.mat33, device="cpu")
-        general.volume = wp.zeros(most, dtype=wp.float32, device="cpu")
-        self._of_groups = GroupedMaterial()
-        self._of_groups.starts, self._of_groups.live = starts, live
+        general.volume, general.numbers = wp.zeros(most, dtype=wp.float32, device="cpu"), members
+        self._of_groups = Kept(GroupedMaterial, "isotropic", "lam", "starts", "live")
         #: How many, then which.
         self._degenerate = wp.zeros(most + 1, dtype=wp.int32, device="cpu")
 
@@ -148,52 +147,42 @@ class Dilating:
 
     def _part(self, begin: int, end: int) -> Dilating:
         part = copy(self)
-        part.count, part._of_groups = end - begin, copied(self._of_groups)
-        part._of_groups.starts = self._of_groups.starts[begin : end + 1]
+        part.count, part._starts = end - begin, self._starts[begin : end + 1]
+        part._of_groups = copy(self._of_groups)
         part._degenerate = wp.zeros_like(self._degenerate)
         return part
 
     @property
     def nodes(self) -> wp.array:
         """The nodes of the elements in groups, vec4i."""
-        starts = self._of_groups.starts.numpy()
+        starts = self._starts.numpy()
         return self._general.nodes[int(starts[0]) : int(starts[-1])]
 
-    def derive(self, material: IsotropicMaterial) -> None:
-        """Launch the sorting of the groups' elements; may be recorded.
-
-        Args:
-            material: The material of all elements, without lambda.
-        """
-        grouped, most, lam = self._of_groups, len(self._members), self._lam()
-        if grouped.lam is None or (material.stride and len(grouped.lam) != most):
-            mu = none = material.mu
-            if material.stride:
-                mu, none, lam_here = (wp.zeros(most, dtype=wp.float32, device="cpu") for _ in range(3))
-            else:
-                none, lam_here = material.lam, lam
-            grouped.isotropic = isotropic_material([mu, none, material.stride])
-            grouped.lam = lam_here
-        inputs = [self._plan.elements, material, lam, self._members, self._live]
-        wp.launch(self._order, most, inputs, [self._general, grouped], device="cpu")
+    def derive(self) -> None:
+        """Launch the sorting of the groups' elements; may be recorded."""
+        inputs = [self._plan.elements, self._starts, self._live]
+        wp.launch(self._order, len(self._general.nodes), inputs, [self._general], device="cpu")
 
     def kernel(self, law: IsotropicLaw) -> wp.Kernel:
         """The kernel that adds the forces of groups under a law."""
         return scatter_grouped_elements(law, self.of)
 
-    def scatter_groups(self, law: IsotropicLaw, u: wp.array, f: wp.array, repair: wp.Kernel | None = None) -> None:
+    def scatter_groups(
+        self, law: IsotropicLaw, isotropic: IsotropicMaterial, u: wp.array, f: wp.array, repair: wp.Kernel | None = None
+    ) -> None:
         """Add the forces of groups at displacements u to f, both vec4 [N].
 
         Args:
             law: A law of ``kernels.elements.simd8``.
+            isotropic: The material of all elements, without lambda.
             repair: Computes the elements that the law leaves out, if any.
         """
         if not self.count:
             return
-        inputs = [self._general, self.count, self._of_groups, u]
+        inputs = [self._general, self.count, self._of_groups(isotropic, self._lam(), self._starts, self._live), u]
         launch(self.kernel(law), -(-self.count // GROUPS), inputs, [f, self._degenerate], device="cpu")
         if repair is not None:
-            launch(repair, 1, [self._general, self._of_groups.isotropic, u], [self._degenerate, f], device="cpu")
+            launch(repair, 1, [self._plan.elements, isotropic, u], [self._degenerate, f], device="cpu")
 
 
 # --- any law: complete subtrees, and other elements ------------------------------------------------------------------
@@ -232,9 +221,8 @@ class SimdForces:
         self._Material, self._material, self._tolerance = Material, material, tolerance
         self._repairs: tuple[wp.Kernel, ...] = ()
         if repair is not None:
-            kinds = self._kind, GeneralElements
             of_subtrees = repair_own if repair is robust_own_stress else repair_flagged(Material, repair)
-            self._repairs = of_subtrees, *(repair_forces(kind, Material, repair) for kind in kinds)
+            self._repairs = of_subtrees, repair_forces(self._kind, Material, repair)
         self._dilating: Dilating | None = None
         self._near = Kept(ToleranceMaterial, "isotropic", "tolerance")
         self._rotated = Kept(RotatedMaterial, *ROTATED)
@@ -254,7 +242,7 @@ class SimdForces:
     def derive(self) -> None:
         """See ``ForceField``."""
         if self._dilating is not None:
-            self._dilating.derive(self._material())
+            self._dilating.derive()
 
     def follow(self) -> None:
         """See ``ForceField``."""
@@ -281,7 +269,7 @@ class SimdForces:
         if dilating is None and self._lanes is None and self.plan.counts is None:
             return found
         found.append(self._of_elements if dilating is None else dilating.kernel(self._name))
-        return [*found, *self._repairs[1:2]]
+        return [*found, *self._repairs[1:]]
 
     def _kernel(self, shape: int, sharing: Sharing) -> wp.Kernel:
         if self._shares_rotations and sharing is not Sharing.OWN:
@@ -318,7 +306,7 @@ class SimdForces:
                     repair, where = repair_shared, [flags, first, batch.subtrees.code, places_on("cpu").subtree]
                 launch(repair, len(flags), [*where, *inputs], [f], device="cpu")
         if self._dilating is not None:
-            self._dilating.scatter_groups(self._name, u, f, self._repairs[2] if self._repairs else None)
+            self._dilating.scatter_groups(self._name, given, u, f, *self._repairs[1:])
         elif self._lanes is not None:
             self._lanes.scatter_forces(given, u, f)
 

@@ -174,7 +174,7 @@ class DilatationField(ForceField):
             self._count_groups()
             self._joined = self.plan is self.shear.plan and self.shear.share_dilatation(self._lanes)
             if not self._joined:
-                self._lanes.derive(self.shear.isotropic)
+                self._lanes.derive()
             return
         found = self.shear.in_clusters
         if found is not None and self.slots is None:
@@ -219,13 +219,8 @@ class DilatationField(ForceField):
     def derive(self) -> None:
         self._groups.derive()
         if self._lanes is not None and not self._joined:
-            self._lanes.derive(self.shear.isotropic)
+            self._lanes.derive()
         self.shear.derive()
-
-    def take_material(self) -> None:
-        self.shear.take_material()
-        if self._lanes is not None and not self._joined:
-            self._lanes.derive(self.shear.isotropic)
 
     def follow(self) -> None:
         self._count_groups()
@@ -266,7 +261,7 @@ class DilatationField(ForceField):
         if self._lanes is None and self._clustered is None:
             self._scatter_others(u, f)
         elif self._lanes is not None and not self._joined:
-            self._lanes.scatter_groups(STRESSLESS, u, f)
+            self._lanes.scatter_groups(STRESSLESS, self.shear.isotropic, u, f)
 
     def _scatter_others(self, u: wp.array, f: wp.array) -> None:
         """Add the forces of elements outside subtrees, in three passes (CUDA)."""

@@ -15,14 +15,14 @@ from warp_corot.discretization.plan import Plan
 from warp_corot.elasticity.clusters import divided
 from warp_corot.elasticity.cpu import SimdForces
 from warp_corot.elasticity.dilatation import AUTO, bind_law, check_dilatation
-from warp_corot.elasticity.model import ForceField, LawField, Model
+from warp_corot.elasticity.model import ElementField, ForceField, Model
 from warp_corot.errors import InputError
 from warp_corot.inputs.checks import checked_number, shown
 from warp_corot.inputs.loading import LoadedKernel, load
 from warp_corot.kernels.clusters.laws import isotropic_law
-from warp_corot.kernels.elements.constitutive import IsotropicMaterial
+from warp_corot.kernels.elements.constitutive import IsotropicMaterial, law_functions
 from warp_corot.kernels.elements.dilatation import GREEN, LOG_VOLUME, SMALL, Dilatation
-from warp_corot.kernels.elements.forces import scatter_chosen
+from warp_corot.kernels.elements.forces import law_cauchy, law_differential, law_stress, law_value, scatter_chosen
 from warp_corot.kernels.elements.simd8 import IsotropicLaw, stretch_limits
 from warp_corot.kernels.subtrees import cuda as subtree_cuda
 from warp_corot.kernels.subtrees.degenerate import NO_LIST
@@ -34,21 +34,32 @@ if TYPE_CHECKING:
     from warp_corot.elasticity.clusters import ClusterScatter
 
 
-class LawCudaField(LawField):
-    """Complete subtrees in batches, and other elements in clusters or one by one, under the same law.
+class LawField(ElementField):
+    """Complete subtrees in batches under a law of the package; other elements, on CUDA, in clusters or one by one.
 
     Args:
-        discretization: A mesh on CUDA.
-        law, deterministic: As for ``LawField``.
+        discretization: The mesh and the material.
+        law: The law.
+        deterministic: As for every field.
     """
 
-    def __init__(self, discretization: Discretization, law: IsotropicLaw, *, deterministic: bool = False):
-        super().__init__(discretization, law, deterministic=deterministic)
+    def __init__(self, law: IsotropicLaw, discretization: Discretization, deterministic: bool = False):
+        self._law = of = law_functions(law)
+        super().__init__(
+            discretization,
+            stress=law_stress(of.stress),
+            differential=law_differential(of.differential),
+            density=law_value(of.energy),
+            cauchy=law_value(of.stress) if law == "linear" else law_cauchy(of.stress),
+            deterministic=deterministic,
+        )
         self._uniform = discretization.material_stride == 0
+        if self.device.is_cpu:
+            self._simd = SimdForces(discretization, self.plan, law, lambda: self.isotropic)
         self.follow()
 
     def plan_of(self, discretization: Discretization) -> Plan:
-        subtrees = self.deterministic or discretization.prefers_subtrees
+        subtrees = self.device.is_cpu or self.deterministic or discretization.prefers_subtrees
         return discretization.plan(subtrees=subtrees, deterministic=self.deterministic)
 
     @property
@@ -58,14 +69,21 @@ class LawCudaField(LawField):
             return [*of_subtrees, self._clusters.kernel]
         if self._batches and not len(self.plan.flat):
             return of_subtrees
-        return [*of_subtrees, self._of_flat if len(self.plan.flat) else self._forces]
+        return [*of_subtrees, self._of_flat] if len(self.plan.flat) else super()._force_kernels
 
     def load_kernels(self) -> None:
+        if self._simd is not None:
+            super().load_kernels()
+            return
         kernels = [self._kernel(shape, grouped) for shape, grouped, _sharing in self.plan.kinds]
         load((), self.device, [self._forces, self._of_flat, *((kernel, BLOCK) for kernel in kernels)])
 
     def follow(self) -> None:
-        self._batches, self._clusters = divided(self.discretization, self.plan, isotropic_law(self.functions.stress))
+        super().follow()
+        self._batches: list[Batch] = []
+        self._clusters: ClusterScatter | None = None
+        if self._simd is None:
+            self._batches, self._clusters = divided(self.discretization, self.plan, isotropic_law(self._law.stress))
         self._kernels = [self._kernel(batch.shape, batch.grouped) for batch in self._batches]
 
     @property
@@ -77,9 +95,12 @@ class LawCudaField(LawField):
         return None if self._clusters is None else (self._clusters, self._batches)
 
     def _kernel(self, shape: int, grouped: bool) -> wp.Kernel:
-        return subtree_cuda.scatter_law_subtrees(shape, grouped, self._uniform, self.functions.stress)
+        return subtree_cuda.scatter_law_subtrees(shape, grouped, self._uniform, self._law.stress)
 
     def scatter_forces(self, u: wp.array, f: wp.array) -> None:
+        if self._simd is not None:
+            self._simd.scatter_forces(u, f)
+            return
         isotropic, flat = self.isotropic, self.plan.flat
         for batch, kernel in zip(self._batches, self._kernels, strict=True):
             inputs, outputs = [batch.subtrees, isotropic, u], [f, batch.flagged, NO_LIST]
@@ -90,38 +111,6 @@ class LawCudaField(LawField):
             self.launch(self._of_flat, len(flat), [self.elements, flat.leaves, isotropic, u], [f])
         elif not self._batches:
             super().scatter_forces(u, f)
-
-
-class LawSimdField(LawField):
-    """Complete subtrees of a forest as units of work, other elements one by one, eight of each in the lanes.
-
-    Args:
-        discretization: On the CPU.
-        law: The law.
-        deterministic: As for every field.
-    """
-
-    def __init__(self, discretization: Discretization, law: IsotropicLaw, *, deterministic: bool = False):
-        super().__init__(discretization, law, deterministic=deterministic)
-        self._simd = SimdForces(discretization, self.plan, law, lambda: self.isotropic)
-
-    def plan_of(self, discretization: Discretization) -> Plan:
-        return discretization.plan()
-
-
-# --- the choice of kernels -------------------------------------------------------------------------------------------
-
-
-def law_field(law: IsotropicLaw, discretization: Discretization, deterministic: bool = False) -> LawField:
-    """The fastest force field of a law of the package on a discretization.
-
-    Args:
-        law: The law.
-        discretization: The mesh and the material.
-        deterministic: As for every field.
-    """
-    kind = LawSimdField if discretization.device.is_cpu else LawCudaField
-    return kind(discretization, law, deterministic=deterministic)
 
 
 # --- models of one law -----------------------------------------------------------------------------------------------
@@ -145,10 +134,7 @@ class LawModel(Model):
         check_dilatation(self.dilatation)
 
     def bind(self, body: Discretized | Discretization, *, deterministic: bool = False) -> ForceField:
-        return bind_law(self._field, self.shared, self.dilatation, body, deterministic)
-
-    def _field(self, discretization: Discretization, deterministic: bool) -> ForceField:
-        return law_field(self.law, discretization, deterministic)
+        return bind_law(partial(LawField, self.law), self.shared, self.dilatation, body, deterministic)
 
 
 # --- linear elasticity: right for small rotations, swells in large ones ----------------------------------------------
@@ -282,7 +268,7 @@ class Ogden(Model):
         return max(low), min(high)
 
     def bind(self, body: Discretized | Discretization, *, deterministic: bool = False) -> ForceField:
-        return bind_law(partial(law_field, self.terms), LOG_VOLUME, self.dilatation, body, deterministic)
+        return bind_law(partial(LawField, self.terms), LOG_VOLUME, self.dilatation, body, deterministic)
 
 
 def _numbers(given: Any, name: str) -> tuple[float, ...]:

@@ -23,18 +23,13 @@ from warp_corot.inputs.loading import LoadedKernel, load
 from warp_corot.kernels.corotated.anisotropic import FibreMaterial, ReinforcedMaterial
 from warp_corot.kernels.corotated.tangent import KeptStrains
 from warp_corot.kernels.elements.added import Prestress, PronyMaterial
-from warp_corot.kernels.elements.constitutive import IsotropicMaterial, RotatedMaterial, law_functions
+from warp_corot.kernels.elements.constitutive import IsotropicMaterial, RotatedMaterial
 from warp_corot.kernels.elements.dilatation import DilatedMaterial
 from warp_corot.kernels.elements.forces import (
     element_energies,
     element_von_mises,
-    law_cauchy,
-    law_differential,
-    law_stress,
-    law_value,
     scatter_forces,
 )
-from warp_corot.kernels.elements.simd8 import IsotropicLaw
 
 if TYPE_CHECKING:
     from warp_corot.elasticity.clusters import ClusterScatter
@@ -249,11 +244,6 @@ class ForceField(ABC):
 
         Called if plans change, each time after one is derived.
         """
-        if self._simd is not None:
-            self._simd.derive()
-
-    def take_material(self) -> None:
-        """Copy Lamé's parameters again, because their values have changed in the arrays."""
         if self._simd is not None:
             self._simd.derive()
 
@@ -508,23 +498,3 @@ class ElementField(ForceField):
 
     def write_von_mises(self, u: wp.array, stress: wp.array) -> None:
         self.launch(self._von_mises, self.element_count, [self.elements, self.material_shown, u], [stress])
-
-
-class LawField(ElementField):
-    """Force field of a constitutive law, element by element.
-
-    Args:
-        body, deterministic: As for every field.
-        law: The law.
-    """
-
-    def __init__(self, body: Discretized | Discretization, law: IsotropicLaw, *, deterministic: bool = False):
-        self.functions = of = law_functions(law)
-        super().__init__(
-            body,
-            stress=law_stress(of.stress),
-            differential=law_differential(of.differential),
-            density=law_value(of.energy),
-            cauchy=law_value(of.stress) if law == "linear" else law_cauchy(of.stress),
-            deterministic=deterministic,
-        )

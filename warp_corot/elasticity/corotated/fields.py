@@ -307,7 +307,7 @@ class SubtreeField(CorotatedField):
         self._degenerate: DegenerateLeaves | None = None
         self._own_launches: OwnLaunches | None = None
         if self._listed:
-            if self.rotation_level is None and (OwnLaunches.suit(plan) or self.discretization.awaited is not None):
+            if self.rotation_level is None:
                 given = self.isotropic, self._clusters, self.discretization.awaited
                 self._own_launches = OwnLaunches(plan, *given)
                 self._degenerate = DegenerateLeaves(self._own_launches.places, [], self.device)

@@ -163,13 +163,6 @@ class OwnLaunches:
         return [*found, *([self._clusters.kernel] if isinstance(self._clusters, ClusterScatter) else [])]
 
     @staticmethod
-    def suit(plan: Plan) -> bool:
-        """Whether a plan of own rotations has more than one large batch, or may come to have."""
-        if plan.counts is not None or len(plan.batches) > 1 or len(plan.flat) > 0:
-            return True
-        return 8 * sum(batch.count for batch in plan.batches if batch.grouped) < UNIFORM_LEAVES
-
-    @staticmethod
     def later_kernel(uniform: bool) -> LoadedKernel:
         """The kernel that launches over a changing mesh take."""
         return scatter_body(uniform), BLOCK

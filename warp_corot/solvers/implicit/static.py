@@ -59,12 +59,10 @@ def limited(field: ForceField, limit: float) -> Iterator[None]:
     discretization = field.discretization
     mu, lam = discretization.mu.numpy(), discretization.lam.numpy().copy()
     discretization.lam.assign(np.minimum(lam, limit * mu))
-    field.take_material()
     try:
         yield
     finally:
         discretization.lam.assign(lam)
-        field.take_material()
 
 
 #: Mass in the operator of a free body, as a fraction of that of its slowest vibration.
