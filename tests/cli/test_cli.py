@@ -124,7 +124,7 @@ def test_bear_sags_by_a_tenth_and_comes_to_rest(folder, capsys, options):
 @pytest.mark.parametrize(
     ("size", "said"),
     [
-        (5e-4, "taken as m, .* 500 um long, which is unlikely"),
+        (5e-4, "taken as m, .* 0.5 mm long, which is unlikely"),
         (2.9, "taken as m, .* 2.9 m long .--unit"),
         (4.4, "taken as cm, .* 44 mm"),
         (49, "taken as mm, .* 49 mm"),

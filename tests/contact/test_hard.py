@@ -306,7 +306,7 @@ def test_a_tool_smaller_than_the_elements_under_it_causes_a_warning(device, radi
     assert len(said) == is_small
     if is_small:
         assert "sphere, 10 mm thick" in said[0]
-        assert "edges of 1.2 mm would do" in said[0]
+        assert "edges of 1.25 mm would do" in said[0]
 
 
 def test_overlaps_at_the_start_cause_a_warning(device):

@@ -239,7 +239,7 @@ def test_units_and_unlikely_sizes():
     assert np.allclose(Domain.from_surface((250 * CUBE[0], CUBE[1]), unit="mm").bounds, 0.25 * metres)
     with pytest.warns(UserWarning, match=r"300 m long.*in mm, give unit='mm'.*0\.001: 300 mm"):
         Domain.from_surface((300 * CUBE[0], CUBE[1]))
-    with pytest.warns(UserWarning, match="300 um long: is its unit right"):
+    with pytest.warns(UserWarning, match="0.3 mm long: is its unit right"):
         Domain.from_surface((3e-4 * CUBE[0], CUBE[1]))
     assert np.allclose(Domain.from_surface(CUBE, unit="inch").bounds, 0.0254 * metres)
     for unit in ("kg", "inches of rope", "-3mm", 0.0):

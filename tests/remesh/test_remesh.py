@@ -202,7 +202,7 @@ def test_random_passes_in_pools_that_are_often_full(passes, device, rng):
         full += free_leaves(adaptive) < 12
     assert adaptive.carriage.arrays.mass.numpy().sum() == pytest.approx(mass, rel=1e-12)
     assert is_full(adaptive)
-    assert full > passes / 20  # how often depends on the numbering, which CUDA's threads give in any order
+    assert full >= passes / 20  # how often depends on the numbering, which CUDA's threads give in any order
     assert mesh.levels.max() > 6
 
 

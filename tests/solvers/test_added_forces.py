@@ -60,7 +60,8 @@ def test_a_stiff_spring_shortens_the_step(device):
     assert sim.stable_dt == pytest.approx(0.5 * before, rel=1e-6)
     assert sim.dt < 0.5 * before
     sim.advance(0.05)
-    assert np.abs(body.displacements.numpy()).max() < 1e-5
+    # It swings between rest and twice the depth at which the springs bear it.
+    assert np.abs(body.displacements.numpy()).max() < 2.2 * 9.81 / curvature
 
 
 def test_invalid_forces_are_refused(device):

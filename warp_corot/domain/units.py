@@ -143,8 +143,8 @@ def _suited(value: float, units: Sequence[tuple[str, float]], digits: int = 3) -
 
 
 def length(metres: float) -> str:
-    """A length to three digits in the unit that suits it."""
-    return _suited(metres, LENGTHS)
+    """A length to three digits in the unit that suits it; in micrometres only below a tenth of a millimetre."""
+    return _suited(metres, LENGTHS if abs(metres) < 1e-4 else LENGTHS[:2])
 
 
 def volume(cubic_metres: float) -> str:
