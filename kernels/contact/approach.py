@@ -341,8 +341,9 @@ def position_of(s: int, part: Part, surface: Surface, share: float):
     x = wp.vec3()
     for m in range(4):
         if w[m] != 0.0:
-            i = part.nodes.node[n[m] - part.shift]
-            x += w[m] * (part.nodes.rest[n[m]] + share * load_node(part.dynamics.u, i))
+            k = n[m] - part.shift
+            i = part.nodes.node[k]
+            x += w[m] * (part.nodes.rest[k] + share * load_node(part.dynamics.u, i))
     return x
 
 
