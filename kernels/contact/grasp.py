@@ -1,9 +1,9 @@
 """Springs that pull points of bodies to places: nodes that a tool holds, and patches that a person holds on the page.
 
-A row is one spring on the weighted mean of some points, each of which up to four nodes carry. In implicit steps its
-force is that at the end of a step, and the matrix has its stiffness. A rigid grasp has a spring that is stiffer than
-the body, with the force of the last step as a multiplier, so that what is at rest has no offset; in explicit steps it
-is a constraint.
+A row is a spring that pulls the weighted mean of several points; up to four nodes carry each point. In implicit steps
+its force is that at the end of a step, and the matrix has its stiffness. A rigid grasp has a spring that is stiffer
+than the body, with the force of the last step as a multiplier, so that what is at rest has no offset; in explicit steps
+it is a constraint.
 """
 
 import warp as wp

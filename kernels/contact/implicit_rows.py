@@ -491,7 +491,7 @@ def scale_nodes(
     """v = G v, or G^T v before a preconditioner that knows no rows, where G makes the directions in which they are
     stiff as small as that makes them: G G^T = (1 + D / k)^-1 with their stiffness D and that of the node, k.
 
-    The vector v is that of one body, whose entries begin at ``first`` in those of all.
+    The vector v has the entries of one body, the first of which is entry ``first`` in vectors of all bodies.
     """
     s = start + wp.tid()
     if surface.node[s] < 0 or is_borne(s, surface) or wp.trace(stiffness[s]) <= 0.0:

@@ -381,8 +381,8 @@ def pair_finder(is_wide: bool) -> wp.Kernel:
         i: int, lane: int, start: int, owner: Owner, of_triangles: wp.uint64, of_edges: wp.uint64, surface: Surface,
         meeting: Meeting, near: Near, rows: Rows, kept: Kept,
     ):  # fmt: skip
-        """How many neighbours there are, and how many of them this thread has found, of which it keeps the first ones;
-        or, if a start is given, write all, in any order."""
+        """Count the neighbours, and those that this thread has found; it keeps the first ones. If a start is given,
+        write all of them instead, in any order."""
         count = int(0)
         mine = int(0)
         tree = of_triangles

@@ -437,7 +437,8 @@ def check_sleep(
 
 @wp.func
 def choose_calm(is_clear: bool, needed: float, watch: Watch):
-    """Choose how much to reserve for all nodes, of which sleep needs as much; whether the search must be repeated."""
+    """Choose the motion that is reserved for all nodes, of which contact needs ``needed`` to sleep. Returns whether the
+    search must be repeated."""
     calm = watch.calm[0]
     wait = watch.calm[1]
     if not is_clear:

@@ -80,7 +80,7 @@ def box_triangles(surface: Surface, meeting: Meeting, lower: wp.array[wp.vec3], 
 
 @wp.kernel(enable_backward=False)
 def box_edges(surface: Surface, meeting: Meeting, lower: wp.array[wp.vec3], upper: wp.array[wp.vec3]):
-    """Find the boxes of edges, after those of triangles, and the sums of the normals at each."""
+    """Find the boxes of edges, and the sum of the normals of the triangles at each, which must be known."""
     k = wp.tid()
     e = meeting.edges[k]
     if e[0] < 0:

@@ -80,7 +80,8 @@ class Simulation(Cutting):
             too long, the run ends with an error.
         gravity: [m/s^2]; None for 9.81 against the up axis of the first body's mesh.
         deterministic: Whether every run must give the same result bit by bit. The CPU always does; on CUDA, forces are
-            then added up in a fixed order, which takes time and memory (``benchmarks/README.md``).
+            then added up in a fixed order, which takes time and memory (``benchmarks/README.md``); but for points of
+            grasps and of the page's hands that share nodes.
         remesh: How the bodies' meshes follow their motion; for several bodies also one each, None for meshes that
             never change.
         obstacles: Rigid obstacles of the bodies: shapes at rest, such as ``Ground`` and ``Box``, and tools, which move.
