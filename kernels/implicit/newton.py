@@ -322,7 +322,7 @@ def end_only(
 ):
     """A world with one iteration ended as its linear solve did, and a residual that falls no more is small enough."""
     world = wp.tid()
-    if iterations[world] == 1 and (status[world] == CONVERGED or status[world] == STUCK):
+    if iterations[world] == 1 and status[world] <= STUCK:
         status[world] = wp.where(inner_status[world] == CONVERGED, CONVERGED, LIMIT)
         if inner_status[world] == BROKEN or not is_number(scalars[world, SLOPE_NOW]):
             status[world] = BROKEN

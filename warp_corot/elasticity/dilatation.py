@@ -43,6 +43,10 @@ class SharedTangent(Tangent):
     Args:
         field: The field.
         exact: As for ``ForceField.tangent``.
+
+    Attributes:
+        shear: The tangent of the law's field.
+        shared: The change of h' and w' of the elements, see ``kernels.elements.dilatation``, vec4 [T].
     """
 
     field: DilatationField
@@ -56,7 +60,7 @@ class SharedTangent(Tangent):
         self._of_elements = ElementTangent(field, *own)
         self._holds = field.of.is_held
         self._version = -1
-        self._shared = wp.zeros(0, dtype=wp.vec4, device=field.device)
+        self.shared = wp.zeros(0, dtype=wp.vec4, device=field.device)
 
     @property
     def kernels(self) -> list[wp.Kernel]:
@@ -69,7 +73,7 @@ class SharedTangent(Tangent):
         field, version = self.field, self.field.discretization.sizes.version
         if self._version != version:
             self._version = version
-            self._shared = wp.zeros(field.element_count, dtype=wp.vec4, device=field.device)
+            self.shared = wp.zeros(field.element_count, dtype=wp.vec4, device=field.device)
             self._members = field.members()
             self._rows = rows.GroupRows()
             self._rows.rows = wp.zeros(self._members.entries, dtype=wp.vec4, device=field.device)
@@ -80,7 +84,7 @@ class SharedTangent(Tangent):
         self.shear.take(u)
         field = self.field
         inputs = [field.elements, field.isotropic, self.displacements, self._members.arrays]
-        outputs = [self._rows, self._shared]
+        outputs = [self._rows, self.shared]
         field.launch(rows.write_rows(field.kind, field.of), self._members.count, inputs, outputs)
 
     def add_product(self, p: wp.array, y: wp.array) -> None:
@@ -92,7 +96,7 @@ class SharedTangent(Tangent):
         if self._turns:
             self._of_elements.add_product(p, y)
         elif self._holds:
-            inputs = [field.elements, self.displacements, p, *groups, self._shared]
+            inputs = [field.elements, self.displacements, p, *groups, self.shared]
             field.launch(rows.add_held(field.kind, field.of), count, inputs, [y])
 
     def add_diagonal(self, blocks: wp.array) -> None:
@@ -104,7 +108,7 @@ class SharedTangent(Tangent):
 
     def _material(self) -> DilatedMaterial:
         material = DilatedMaterial()
-        material.isotropic, material.shared = self.field.isotropic, self._shared
+        material.isotropic, material.shared = self.field.isotropic, self.shared
         material.turning = float(self._turns)
         return material
 

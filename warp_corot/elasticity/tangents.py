@@ -88,7 +88,7 @@ class SumTangent(Tangent):
 
     def __init__(self, first: Tangent, second: Tangent):
         super().__init__(second.field)
-        self._both = first, second
+        self.first, self._both = first, (first, second)
 
     @property
     def kernels(self) -> list[wp.Kernel]:

@@ -1,7 +1,8 @@
 """The values of each level's matrix: the finest from the leaves, the others from the next finer level.
 
 A leaf has K_mn = V (lambda g_m g_n^T + mu g_n g_m^T + mu (g_m . g_n) I) with the gradients g of its hat functions,
-turned by its rotation: the corotated R K R^T, or linear elasticity without the rotation. Every entry gathers its
+turned by its rotation: the corotated R K R^T, or linear elasticity without the rotation. Leaves in tension also have
+V / 2 [g_m]x^T Theta [g_n]x - V [p S (g_m x g_n)]x of ``corotated.tension``. Every entry gathers its
 contributions, so there are no atomic additions and sums have a fixed order.
 
 Entries are stored transposed, as ``cycle.row_product`` takes them. Rows and columns of held nodes are zero; their
@@ -109,6 +110,9 @@ class Leaves:
     scales: wp.array[float]  # of the operator
     stiffening: float  # viscous damping counts as so many times b K
     most_lambda: float  # lambda counts as so many times mu at most
+    taut: wp.array[wp.uint8]  # see ``corotated.tension``; none if it does not count
+    twists: wp.array[wp.mat33]
+    swells: wp.array[wp.mat33]
     nodes: wp.array[wp.int32]  # by rank
     inverse_mass: wp.array[float]  # by node
     free: wp.array[wp.uint8]
@@ -132,6 +136,28 @@ class Leaves:
     const auto turned = [](const float* q, const float* g) {
         const four x = {q[0], q[3], q[6], 0.0f}, y = {q[1], q[4], q[7], 0.0f}, z = {q[2], q[5], q[8], 0.0f};
         return x * g[0] + y * g[1] + z * g[2];
+    };
+    // [a]x^T H [b]x with H half of Theta, by columns of products of H; and -[p S (a x b)]x.
+    const auto add_tension = [&](long long t, const four& a, const four& b, four* c) {
+        const float* theta = &leaves.twists.data[t].data[0][0];
+        four h[3], ha = {}, hb = {};
+        for (int k = 0; k < 3; ++k) {
+            h[k] = four{theta[3 * k], theta[3 * k + 1], theta[3 * k + 2], 0.0f} * 0.5f;
+            ha += h[k] * a[k];
+            hb += h[k] * b[k];
+        }
+        const float trace = h[0][0] + h[1][1] + h[2][2], along = a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
+        const float d = trace * along - (ha[0] * b[0] + ha[1] * b[1] + ha[2] * b[2]);
+        for (int j = 0; j < 3; ++j) c[j] += h[j] * -along + b * (ha[j] - trace * a[j]) + hb * a[j];
+        float w[3] = {};
+        if (leaves.swells.shape[0]) {
+            const float* s = &leaves.swells.data[t].data[0][0];
+            const float n[3] = {a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]};
+            for (int i = 0; i < 3; ++i) w[i] = s[3 * i] * n[0] + s[3 * i + 1] * n[1] + s[3 * i + 2] * n[2];
+        }
+        c[0] += four{d, -w[2], w[1], 0.0f};
+        c[1] += four{w[2], d, -w[0], 0.0f};
+        c[2] += four{-w[1], w[0], d, 0.0f};
     };
     const long long count = upper.shape[0];
     const int last = count * (number + 1) / parts;
@@ -166,6 +192,7 @@ class Leaves:
             c[0] += la * b[0] + mb * a[0] + four{d, 0.0f, 0.0f, 0.0f};
             c[1] += la * b[1] + mb * a[1] + four{0.0f, d, 0.0f, 0.0f};
             c[2] += la * b[2] + mb * a[2] + four{0.0f, 0.0f, d, 0.0f};
+            if (leaves.taut.shape[0] && leaves.taut.data[t]) add_tension(t, a, b, c);
         }
         float* own = &blocks.data[(long long)world * leaves.entries + places.data[u][0]].data[0][0];
         float* mirrored = &blocks.data[(long long)world * leaves.entries + places.data[u][1]].data[0][0];

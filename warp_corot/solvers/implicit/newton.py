@@ -143,8 +143,8 @@ class Newton:
         sums.launch_scalars(kernels.judge_step, inputs, [self._scalars, self.status, self.running])
 
     def launch_only(self, linear_tolerance: wp.array) -> None:
-        """Launch a single iteration in all worlds, from a guess of ``step``. Worlds whose step goes too far, since the
-        matrix lacks a part of the derivative, begin again and iterate.
+        """Launch a single iteration in all worlds, from a guess of ``step``. If the matrix may be indefinite, worlds
+        whose step goes too far begin again and iterate.
 
         Args:
             linear_tolerance: Tolerance of the only linear solve in each world, float64 [worlds].
@@ -156,6 +156,18 @@ class Newton:
         wp.copy(self.solver.tolerance, linear_tolerance)
         self.system.solve(guessed=True)
         self._begin_search()
+        if self.operator.tension is None:
+            self._judge_only()
+        self._try_step(commits=True)
+        if self.operator.tension is None:
+            turned, self.turned = self.turned, None
+            wp.capture_while(self.running, self.launch_iteration)
+            self.turned = turned
+        inputs = [self._scalars, self.iterations, self.solver.status]
+        wp.launch(kernels.end_only, self.worlds, inputs, [self.status], device=self.device)
+
+    def _judge_only(self) -> None:
+        """Launch the decision of which worlds begin again, since their only step goes too far."""
         self._try_step(commits=False)
         self.field.add_forces(self.body.state.displacements, self.forces)
         self.ranks.owned(self.body).clear_ghosts(self.forces)
@@ -163,12 +175,6 @@ class Newton:
         outputs = [self._scalars, self.status, self.running]
         self._sums.launch_scalars(kernels.judge_only, [self.inertia], outputs)
         self.forces.zero_()
-        self._try_step(commits=True)
-        turned, self.turned = self.turned, None
-        wp.capture_while(self.running, self.launch_iteration)
-        self.turned = turned
-        inputs = [self._scalars, self.iterations, self.solver.status]
-        wp.launch(kernels.end_only, self.worlds, inputs, [self.status], device=self.device)
 
     def _begin_search(self) -> None:
         """Launch the trial of the whole step in all worlds that run."""

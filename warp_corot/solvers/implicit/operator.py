@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     from warp_corot.body.soft_body import SoftBody
     from warp_corot.kernels.implicit.assembled import Couplings
 
+    from .tension import Tension
+
 
 class Product(Protocol):
     """A symmetric matrix A as what it does to vectors.
@@ -50,6 +52,7 @@ class LinearOperator(Product, Protocol):
         inverse_mass: Zero at nodes that are not free, float32 [worlds * nodes] [1/kg].
         displacements: The displacements of the linearisation, vec4 [worlds * nodes] [m]; they change with each one.
         scales: a [1/s^2], b [1/s] and c, float32 [3] on the device, so that recorded launches stay valid.
+        tension: The stiffness of tension, a part of K, or None.
         revision: Changes whenever launches do, so that they must be recorded again: other arrays, other elements. A
             new linearisation or new scales do not change it.
     """
@@ -62,6 +65,9 @@ class LinearOperator(Product, Protocol):
 
     @property
     def scales(self) -> wp.array: ...
+
+    @property
+    def tension(self) -> Tension | None: ...
 
     @property
     def revision(self) -> int: ...

@@ -40,7 +40,7 @@ class ImplicitIntegrator(Integrator):
         damping: Rate of mass-proportional damping >= 0 [1/s].
         viscosity: Viscous over elastic stress at one strain >= 0 [s], as for ``SymplecticEuler``.
         tolerance: None: one iteration of Newton's method, a linear solve, as is usual in interactive simulation, and
-            more only where it goes too far: taut membranes have a stiffness that the matrix lacks. ``BackwardEuler``
+            more only where it goes too far with a law other than ``Corotated`` and without contact. ``BackwardEuler``
             bears that with long steps, and it is the default there; the others need short ones. A
             number: iterations with a line search on the energy until the residual is less than this share of the
             forces, or the last one moves no node by more than this share of the largest displacement.

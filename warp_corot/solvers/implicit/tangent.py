@@ -13,6 +13,7 @@ from warp_corot.kernels.implicit.tangent import finish_blocks, finish_rows
 from warp_corot.solvers.halo import ALONE, Halo
 
 from .conjugate_gradients import WorldSums
+from .tension import Tension
 
 if TYPE_CHECKING:
     from warp_corot.body.soft_body import SoftBody
@@ -34,7 +35,8 @@ class TangentOperator:
         number: The number of the body.
 
     Attributes:
-        tangent: The elastic K.
+        tangent: The elastic K, without tension's part if there is a ``tension``.
+        tension: The rest of the elastic K, or None.
         frame: Displacements whose rotations turn viscous forces [m], vec4; None: those of the linearisation.
     """
 
@@ -56,6 +58,7 @@ class TangentOperator:
         self.tangent = field.tangent(exact=exact)
         self.frame: wp.array | None = None
         self.scales = wp.array([0.0, 0.0, 1.0], dtype=wp.float32, device=self.device)
+        self.tension = None if exact else Tension.of(field, self.tangent, body.conditions.mass, self.scales)
         self._none = wp.zeros(1, dtype=wp.vec4, device=self.device)
         self._no_blocks = wp.zeros(1, dtype=wp.mat33, device=self.device)
         self._blocks = wp.zeros(0, dtype=wp.mat33, device=self.device)
@@ -65,6 +68,8 @@ class TangentOperator:
         """Make room for the body's present nodes; not while launches are recorded."""
         u = self.body.state.displacements
         self.tangent.prepare(u)
+        if self.tension is not None:
+            self.tension.prepare()
         if len(self._blocks) != len(u):
             self._damped = self._none if self.viscosity is None else wp.zeros_like(u)
             self._blocks = wp.zeros(len(u), dtype=wp.mat33, device=self.device)
@@ -92,11 +97,19 @@ class TangentOperator:
     def take(self, u: wp.array) -> None:
         """Launch the linearisation at displacements u [m], vec4 [worlds * nodes]."""
         self.tangent.take(u)
+        if self.tension is not None:
+            self.tension.take(u)
+
+    def add_elastic_product(self, p: wp.array, y: wp.array) -> None:
+        """Launch y += K p [N], of elastic forces; both vec4 [worlds * nodes]."""
+        self.tangent.add_product(p, y)
+        if self.tension is not None:
+            self.tension.add_product(p, y)
 
     def apply(self, x: wp.array, y: wp.array) -> None:
         y.zero_()
         everywhere = self.ranks.exchange(self.number, x, copies=True)
-        self.tangent.add_product(everywhere, y)
+        self.add_elastic_product(everywhere, y)
         for forces in self.stiff_forces:
             forces.add_stiffness(self.body, x, y)
         if self.viscosity is not None:
@@ -111,6 +124,8 @@ class TangentOperator:
         blocks, conditions = self._blocks, self.body.conditions
         blocks.zero_()
         self.tangent.add_diagonal(blocks)
+        if self.tension is not None:
+            self.tension.add_diagonal(blocks)
         for forces in self.stiff_forces:
             forces.add_diagonal(self.body, blocks)
         stiffening = 0.0 if self.viscosity is None else self.viscosity.seconds
@@ -173,4 +188,4 @@ class TurnedState:
             self._go_back(forces)
 
     def _go_back(self, forces: wp.array) -> None:
-        self._operator.tangent.add_product(self._way, forces)
+        self._operator.add_elastic_product(self._way, forces)

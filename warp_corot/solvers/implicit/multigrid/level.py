@@ -302,7 +302,7 @@ class LeafMatrix:
     ):
         self._discretization, self.device, sizes = discretization, discretization.device, discretization.sizes
         self._nodes, self._rank, self._mesh_nodes, self._free, self._members = nodes, rank, mesh_nodes, free, members
-        self._write_frames = values.write_frames(is_turned)
+        self.is_turned, self._write_frames = is_turned, values.write_frames(is_turned)
         self._regions = Regions(discretization.team, self.device)
         self.pattern, self._pairs = finder.of_leaves(self._elements.nodes, sizes.world_elements, rank, members)
         self._frames = wp.zeros(sizes.elements, dtype=wp.mat33, device=self.device)
@@ -382,6 +382,9 @@ class LeafMatrix:
         leaves.pairs, leaves.rows, leaves.more, leaves.blocks = self._pairs, self._rows, self._more, blocks
         leaves.scales, leaves.stiffening, leaves.inverse_mass = operator.scales, stiffening, operator.inverse_mass
         leaves.others, leaves.most_lambda = operator.other_blocks(), most_lambda
+        if operator.tension is not None and self.is_turned:
+            leaves.taut, leaves.twists = operator.tension.taut, operator.tension.twists
+            leaves.swells = operator.tension.swells
         if self._members is not None:
             leaves.row_entries, leaves.most_lambda = self._members.entries, 0.0
         return leaves

@@ -1,0 +1,104 @@
+"""The stiffness of tension beside the corotated R K R^T; see ``kernels.corotated.tension``."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+import warp as wp
+
+from warp_corot.elasticity.added_stress import AddedStressField
+from warp_corot.elasticity.corotated.fields import CorotatedField
+from warp_corot.elasticity.dilatation import SharedTangent, law_of
+from warp_corot.elasticity.tangents import SumTangent
+from warp_corot.inputs.cpu_threads import Regions
+from warp_corot.kernels.corotated import tension as kernels
+from warp_corot.kernels.elements.simd8 import LANES
+
+if TYPE_CHECKING:
+    from warp_corot.elasticity import ForceField
+    from warp_corot.elasticity.tangents import Tangent
+
+#: Threads that share the list of taut elements on CUDA.
+THREADS = 1 << 14
+
+
+class Tension:
+    """The stiffness of the elements whose tension counts in a step, for many products at the same displacements.
+
+    Args:
+        field: A field of corotated elements.
+        tangent: Its R K R^T; what it keeps is found before.
+        mass: Of the nodes [kg], float32.
+        scales: Those of the operator, see ``TangentOperator``.
+
+    Attributes:
+        taut: Nonzero for elements that count, uint8 [T].
+        twists, swells: Their Theta and p S in world axes [Pa], mat33 [T]; ``swells`` is empty if no pressure is shared.
+    """
+
+    def __init__(self, field: ForceField, tangent: Tangent, mass: wp.array, scales: wp.array):
+        self._field, self._tangent, self._mass, self._scales = field, tangent, mass, scales
+        self._law, _ = law_of(field)
+        self._device, self._kind = field.device, field.discretization.element_kind
+        self._regions = Regions(field.discretization.team, field.device)
+        self._threads = THREADS if field.device.is_cuda else 1
+        self._none = wp.zeros(0, dtype=wp.vec4, device=field.device)
+        self.taut = wp.zeros(0, dtype=wp.uint8, device=field.device)
+        self.prepare()
+
+    @classmethod
+    def of(cls, field: ForceField, tangent: Tangent, mass: wp.array, scales: wp.array) -> Tension | None:
+        """That of a field whose tangent is the paper's, otherwise None."""
+        while isinstance(field, AddedStressField):
+            assert isinstance(tangent, SumTangent)
+            field, tangent = field.law, tangent.first
+        is_corotated = isinstance(law_of(field)[0], CorotatedField)
+        return cls(field, tangent, mass, scales) if is_corotated else None
+
+    @property
+    def kernels(self) -> list[wp.Kernel]:
+        """Kernels of factories that it launches."""
+        find = kernels.find_taut8 if self._device.is_cpu else kernels.find_taut
+        factories = find, kernels.add_taut_product, kernels.add_taut_diagonal
+        return [kernels.list_taut, *(make(self._kind) for make in factories)]
+
+    def prepare(self) -> None:
+        """Make room for the present elements; not while launches are recorded."""
+        count = self._field.element_count
+        if len(self.taut) != count:
+            device = self._device
+            self.taut = wp.zeros(count, dtype=wp.uint8, device=device)
+            counts = count, count, count * self._field.shares_dilatation
+            self._turns, self.twists, self.swells = (wp.zeros(n, dtype=wp.mat33, device=device) for n in counts)
+            self._listed = wp.zeros(count + 1, dtype=wp.int32, device=device)
+
+    def take(self, u: wp.array) -> None:
+        """Launch the update to displacements u [m], vec4, for which the tangent has been taken."""
+        field, law = self._field, self._law
+        elements, tangent = field.discretization.elements, self._tangent
+        shared = tangent.shared if isinstance(tangent, SharedTangent) else self._none
+
+        inputs = [elements, law.isotropic, field.isotropic, shared, self._mass, self._scales, u]
+        outputs, count = [self.taut, self._turns, self.twists, self.swells], field.element_count
+        if self._device.is_cpu:
+            kernel, key = kernels.find_taut8(self._kind), (u.ptr, shared.ptr)
+            self._regions.launch_from(kernel, -(-count // LANES), [0, count, *inputs], outputs, *key)
+        else:
+            field.launch(kernels.find_taut(self._kind), count, inputs, outputs)
+        self._listed.zero_()
+        threads = count if self._device.is_cuda else 1
+        wp.launch(kernels.list_taut, threads, [self.taut, threads], [self._listed], device=self._device)
+
+    def add_product(self, p: wp.array, y: wp.array) -> None:
+        """Launch y += K p [N]; both vec4 [worlds * N]."""
+        self._launch(kernels.add_taut_product, [self.twists, self.swells], [p], [y])
+
+    def add_diagonal(self, blocks: wp.array) -> None:
+        """Launch the addition of the 3x3 blocks on K's diagonal to those of the nodes [N/m], mat33 [worlds * N]."""
+        self._launch(kernels.add_taut_diagonal, [self.twists], [], [blocks])
+
+    def _launch(self, make: Callable[[type], wp.Kernel], of_elements: list, inputs: list, outputs: list) -> None:
+        field = self._field
+        inputs = [field.discretization.elements, self._turns, *of_elements, self._listed, self._threads, *inputs]
+        field.launch(make(self._kind), self._threads, inputs, outputs)
