@@ -66,8 +66,7 @@ def twist_of(strain: wp.mat33, mu: float, lam: float, pressure: float) -> mat43:
 
 @functools.cache
 def find_taut(Elements: type) -> wp.Kernel:
-    """Find the elements whose tension counts, their rotations, Theta and p S in world axes; a thread an element, on CUDA.
-    """
+    """Find the elements whose tension counts, and their rotations, Theta and p S in world axes (CUDA)."""
 
     @unique_kernel(native=headers("tension", cuda=True))
     def find_taut(
