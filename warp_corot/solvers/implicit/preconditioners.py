@@ -47,11 +47,11 @@ class BlockDiagonal:
 
 
 class Seen:
-    """An operator with some of its arrays replaced."""
+    """An operator with some of its members replaced."""
 
-    def __init__(self, operator: LinearOperator, **arrays: wp.array):
+    def __init__(self, operator: LinearOperator, **members: wp.array | None):
         self._operator = operator
-        vars(self).update(arrays)
+        vars(self).update(members)
 
     def __getattr__(self, name: str) -> object:
         return getattr(self._operator, name)
@@ -79,7 +79,8 @@ class Lagged:
         length = len(operator.inverse_mass)
         self._kept = wp.zeros(length, dtype=wp.vec4, device=self.device)
         self._held = wp.zeros(length, dtype=wp.uint8, device=self.device)
-        self._then = Seen(operator, displacements=self._kept)
+        # Of tension only the present is known, which a resumed run would not find again.
+        self._then = Seen(operator, displacements=self._kept, tension=None)
 
     @property
     def state(self) -> dict[str, wp.array]:
