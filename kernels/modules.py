@@ -19,6 +19,7 @@ def unique_kernel(
     cpu_compiler_flags: str | None = None,
     native: wp.ModuleBuildOptions | None = None,
     fast_math: bool = False,
+    max_unroll: int | None = None,
     **options: Any,
 ):
     """The decorator of kernels that factories make, and of those that few runs launch: each has a module of its own.
@@ -27,10 +28,13 @@ def unique_kernel(
         cpu_compiler_flags: Flags for the CPU's compiler; None: Warp's.
         native: C++ that the module includes; None: none.
         fast_math: Whether CUDA divides and takes roots with errors of some units in the last place, in less code.
+        max_unroll: Loops of more rounds remain loops in C++; None: Warp's number.
         options: Further options of ``wp.kernel``.
     """
     of_module = {"enable_backward": False, "cpu_compiler_flags": cpu_compiler_flags, "extra_build_options": native}
     of_module["fast_math"] = fast_math
+    if max_unroll is not None:
+        of_module["max_unroll"] = max_unroll
     return wp.kernel(module="unique", enable_backward=False, module_options=of_module, **options)
 
 

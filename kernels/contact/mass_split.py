@@ -436,6 +436,9 @@ def solver(has_triangles: bool, has_pairs: bool, on_cpu: bool) -> wp.Kernel:
     of = phases(has_triangles, has_pairs)
     contact_of, keep, locate, iterate = of.contact_of, of.keep, of.locate, of.iterate
     contact_count, number_of = of.contact_count, of.number_of
+    # Loops over the four places and their four nodes would be 16 times their code, which the CPU's compiler takes
+    # twice as long to compile and which is no faster.
+    max_unroll = 1 if on_cpu else None
 
     @wp.func
     def correct(number: int, before: int, dt: float, all: Contacts, sums: Sums):
@@ -448,20 +451,20 @@ def solver(has_triangles: bool, has_pairs: bool, on_cpu: bool) -> wp.Kernel:
     def correct_listed(
         k: int, phase: int, iterations: int, dt: float, all: Contacts, records: wp.array[Contact], sums: Sums
     ):
-        """Correct the force of the k-th contact that may act; between iterations it is in a record."""
+        """Correct the force of the k-th contact that may act; between iterations it is in a record, if there is one."""
         contact = Contact()
-        if phase == LOCATE + 1:
+        if phase == LOCATE + 1 or k >= records.shape[0]:
             contact = contact_of(sums.live[k], dt, all)
-        if phase > LOCATE + 1:
+        else:
             contact = records[k]
         if contact.acts != WAITS or is_pushed(contact, all.rigid.surface, sums):
             contact = iterate(contact, (phase - 1) % 2, all.rigid.law, all.rigid.surface, sums)
-        if phase < iterations:
+        if phase < iterations and k < records.shape[0]:
             records[k] = contact
         else:
             keep(sums.live[k], contact, all)
 
-    @unique_kernel(grid_stride=False, launch_bounds=(64, 4), fast_math=True, cpu_compiler_flags=INLINED)
+    @unique_kernel(INLINED, fast_math=True, max_unroll=max_unroll, grid_stride=False, launch_bounds=(64, 4))
     def solve_contacts(
         # In
         threads: int,
@@ -534,10 +537,7 @@ def solver(has_triangles: bool, has_pairs: bool, on_cpu: bool) -> wp.Kernel:
             while phase <= wp.min(last, iterations) and are_separate == 0:
                 k = int(start)
                 while k < sums.live_count[0]:
-                    if k < records.shape[0]:
-                        correct_listed(k, phase, iterations, dt, all, records, sums)
-                    else:
-                        correct(sums.live[k], (phase - 1) % 2, dt, all, sums)
+                    correct_listed(k, phase, iterations, dt, all, records, sums)
                     k += threads
                 phase += 1
         else:
