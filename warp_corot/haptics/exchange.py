@@ -161,7 +161,8 @@ class LocalModel:
         size = float(np.linalg.norm(state.force))
         self._position, self._force, self._torque = state.position, state.force, state.torque
         if size < NO_FORCE:
-            self._leave()
+            self.normal, self.stiffness = np.zeros(3), self._expected
+            self._depth = self._push = self._square = self._product = 0.0
             return
         normal = state.force / size
         touched = self.normal.any()
@@ -198,10 +199,6 @@ class LocalModel:
         self._product = MEMORY * (self._product + new * off_depth * off_push)
         found = (self._product + SPREAD**2 * self._expected) / (self._square + SPREAD**2)
         self.stiffness = float(np.clip(found, 0.0, self._most))
-
-    def _leave(self) -> None:
-        self.normal, self.stiffness = np.zeros(3), self._expected
-        self._depth = self._push = self._square = self._product = 0.0
 
 
 class PassivityControl:
