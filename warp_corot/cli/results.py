@@ -6,6 +6,7 @@ import argparse
 import contextlib
 import csv
 import itertools
+import math
 import pickle
 import tempfile
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
@@ -23,7 +24,7 @@ from warp_corot.contact.tool import Obstacle, Tool
 from warp_corot.errors import InputError
 from warp_corot.inputs.loading import begin_loading
 from warp_corot.io.files.whole import check_output, writing
-from warp_corot.io.pictures.preview import FILMS, check_film, frames_shown, write_film
+from warp_corot.io.pictures.preview import FILMS, GIF_FPS, check_film, write_film
 from warp_corot.simulation.progress import bar_of
 
 from .options import VIEWS, is_static
@@ -227,7 +228,9 @@ class Previews:
         self.views = _views(self.args.preview_views)
         self.frames, self.fps = _frames(self.args.preview_frames, self.count), self.args.fps
         if is_film(path):
-            self.frames, self.fps = frames_shown(path, list(range(self.count + 1)), self.args.fps)
+            # A GIF leaves out frames in between.
+            every = max(math.ceil(self.fps / GIF_FPS - 1e-9), 1) if path.suffix.lower() == ".gif" else 1
+            self.frames, self.fps = list(range(0, self.count + 1, every)), self.fps / every
         elif len(self.frames) * len(self.views) > MOST_PANELS:
             panels = f"{len(self.frames)} frames from {len(self.views)} sides"
             raise InputError(f"--preview would have {panels}; a picture has at most {MOST_PANELS} panels")

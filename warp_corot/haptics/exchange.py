@@ -173,7 +173,19 @@ class LocalModel:
         else:
             self._origin = state.position.copy()
         self.normal = normal
-        self._measure(float((self._origin - state.position) @ normal), float(state.force @ normal), first=not touched)
+        # The slope of force over depth in the last states, if the depths vary enough.
+        depth, push = float((self._origin - state.position) @ normal), float(state.force @ normal)
+        if not touched:
+            self._depth, self._push = depth, push
+            return
+        new = 1.0 - MEMORY
+        off_depth, off_push = depth - self._depth, push - self._push
+        self._depth += new * off_depth
+        self._push += new * off_push
+        self._square = MEMORY * (self._square + new * off_depth * off_depth)
+        self._product = MEMORY * (self._product + new * off_depth * off_push)
+        found = (self._product + SPREAD**2 * self._expected) / (self._square + SPREAD**2)
+        self.stiffness = float(np.clip(found, 0.0, self._most))
 
     def forces(self, position: Floats) -> tuple[Floats, Floats]:
         """Force [N] and torque [N m] on the tool in the hand at a position [m]; the tissue never pulls."""
@@ -185,20 +197,6 @@ class LocalModel:
         if continued <= 0.0 or push <= 0.0:
             return np.zeros(3), np.zeros(3)
         return self._force + self.stiffness * deeper * self.normal, self._torque * min(continued / push, 1.0)
-
-    def _measure(self, depth: float, push: float, *, first: bool) -> None:
-        """Measure the slope of force over depth in the last states, if the depths vary enough."""
-        if first:
-            self._depth, self._push = depth, push
-            return
-        new = 1.0 - MEMORY
-        off_depth, off_push = depth - self._depth, push - self._push
-        self._depth += new * off_depth
-        self._push += new * off_push
-        self._square = MEMORY * (self._square + new * off_depth * off_depth)
-        self._product = MEMORY * (self._product + new * off_depth * off_push)
-        found = (self._product + SPREAD**2 * self._expected) / (self._square + SPREAD**2)
-        self.stiffness = float(np.clip(found, 0.0, self._most))
 
 
 class PassivityControl:

@@ -350,17 +350,34 @@ def frame_told(session: Session, frame: PageFrame) -> bytes:
     return packed(header, *frame.positions, *shades)
 
 
-Command = Callable[[], None]
-
-
 # --- what the browser asks for ---------------------------------------------------------------------------------------
 
 
-def _between(low: float, high: float, given: Any, name: str, unit: str = "") -> float:
-    number = checked_number(given, name, unit)
-    if not low <= number <= high:
-        raise InputError(f"{name} is {number:g}; it must be {low:g} to {high:g}{f' [{unit}]' if unit else ''}")
-    return number
+Check = Callable[[Any, str], Any]
+#: A whole number that is not negative, and whatever a command itself checks.
+COUNT: Check = partial(checked_count, least=0)
+ANY: Check = lambda given, _: given  # noqa: E731
+
+
+def _between(low: float, high: float, unit: str = "") -> Check:
+    def check(given: Any, name: str) -> float:
+        number = checked_number(given, name, unit)
+        if not low <= number <= high:
+            raise InputError(f"{name} is {number:g}; it must be {low:g} to {high:g}{f' [{unit}]' if unit else ''}")
+        return number
+
+    return check
+
+
+def _one_of(words: Collection[str]) -> Check:
+    return partial(checked_choice, choices=words)
+
+
+def _plane(given: Any, _: str) -> Plane | None:
+    if given is None:
+        return None
+    axis, share = _one_of("xyz")(given["axis"], "axis"), _between(0.01, 0.99)(given["share"], "share")
+    return Plane("xyz".index(axis), share, checked_flag(given["flipped"], "flipped"))
 
 
 class Commands:
@@ -372,29 +389,21 @@ class Commands:
     """
 
     def __init__(self, session: Session, saving: Saving):
-        self._session, self._saving, self._options = session, saving, OnlineRemesh()
-        self._known: dict[str, Callable[[Visitor, dict[str, Any]], Command]] = {
-            "press": lambda who, asked: partial(
-                session.press, who.number, checked_count(asked["body"], "body", 0), checked_vector(asked["at"], "at")
-            ),
-            "press tool": lambda who, asked: partial(
-                session.press_tool, who.number, checked_count(asked["number"], "number", 0)
-            ),
-            "move": lambda who, asked: partial(session.move, who.number, checked_vector(asked["by"], "by")),
-            "let go": lambda who, _: partial(session.let_go, who.number),
-            "release": lambda *_: session.release_all,
-            "change": lambda _, asked: self._change(asked["what"]),
-            "use tool": lambda _, asked: partial(session.use_tool, asked["name"], asked["at"]),
-            "tissue": lambda _, asked: self._tissue(asked["what"]),
-            "step": lambda *_: session.step,
-            "reset": lambda *_: session.reset,
-            "save": lambda who, asked: partial(
-                saving.save,
-                who,
-                checked_choice(asked["what"], "what", saving.kinds),
-                _between(0.1, 600.0, asked["seconds"], "seconds", "s"),
-            ),
-            "end early": lambda *_: saving.end_early,
+        self._session, self._options = session, OnlineRemesh()
+        #: What does it, which attribute of the visitor it is told, if any, and the checks of its arguments.
+        self._known: dict[str, tuple[Callable[..., None], str, dict[str, Check]]] = {
+            "press": (session.press, "number", {"body": COUNT, "at": checked_vector}),
+            "press tool": (session.press_tool, "number", {"number": COUNT}),
+            "move": (session.move, "number", {"by": checked_vector}),
+            "let go": (session.let_go, "number", {}),
+            "release": (session.release_all, "", {}),
+            "change": (lambda values: session.change(**values), "", {"what": self._controls}),
+            "use tool": (session.use_tool, "", {"name": ANY, "at": ANY}),
+            "tissue": (self._switch, "", {"what": self._tissue}),
+            "step": (session.step, "", {}),
+            "reset": (session.reset, "", {}),
+            "save": (saving.save, "self", {"what": _one_of(saving.kinds), "seconds": _between(0.1, 600.0, "s")}),
+            "end early": (saving.end_early, "", {}),
         }
 
     def take(self, visitor: Visitor, asked: Any) -> None:
@@ -412,67 +421,58 @@ class Commands:
             InputError: The message asks for nothing that there is, or as the command.
         """
         try:
-            command = self._known[asked["do"]](visitor, asked)
+            act, who, checks = self._known[asked["do"]]
+            given = [check(asked[name], name) for name, check in checks.items()]
         except (KeyError, TypeError, AttributeError):
             raise InputError(f"the page asked for {shown(asked)}, which cannot be done") from None
         if asked["do"] not in ("move", "let go"):
             self._session.note = ""
-        command()
+        act(*{"": (), "number": (visitor.number,), "self": (visitor,)}[who], *given)
 
-    def _change(self, what: dict[str, Any]) -> Command:
+    def _controls(self, what: dict[str, Any], _: str) -> dict[str, Any]:
+        """Values of controls, checked."""
         session = self._session
-        checks: dict[str, Callable[[Any, str], Any]] = {
+        worlds = _one_of(list(map(str, range(session.sim.worlds))))
+        checks: dict[str, Check] = {
             "running": checked_flag,
-            "speed": partial(_between, 0.01, 1.0),
-            "hand": partial(checked_choice, choices=HANDS),
-            "radius": partial(_between, 0.0, 0.25),
-            "strength": partial(_between, 0.02, 1.0),
-            "colors": partial(checked_choice, choices=["", *session.sources]),
-            "surface": partial(checked_choice, choices=[name for each in session.surfaces for name in each]),
-            "world": partial(checked_choice, choices=list(map(str, range(session.sim.worlds)))),
-            "plane": lambda given, _: (
-                None
-                if given is None
-                else Plane(
-                    "xyz".index(checked_choice(given["axis"], "axis", "xyz")),
-                    _between(0.01, 0.99, given["share"], "share"),
-                    checked_flag(given["flipped"], "flipped"),
-                )
-            ),
+            "speed": _between(0.01, 1.0),
+            "hand": _one_of(HANDS),
+            "radius": _between(0.0, 0.25),
+            "strength": _between(0.02, 1.0),
+            "colors": _one_of(["", *session.sources]),
+            "surface": _one_of([name for each in session.surfaces for name in each]),
+            "world": lambda given, name: int(worlds(given, name)),
+            "plane": _plane,
         }
-        values = {name: checks[name](value, name) for name, value in what.items()}
-        if "world" in values:
-            values["world"] = int(values["world"])
-        return partial(session.change, **values)
+        return {name: checks[name](value, name) for name, value in what.items()}
 
-    def _tissue(self, what: dict[str, Any]) -> Command:
+    def _tissue(self, what: dict[str, Any], _: str) -> tuple[dict[str, Any], bool]:
+        """The tissue that is wanted, checked, and whether it loses its weight, under which it would collapse."""
         session, sim = self._session, self._session.sim
-        there = choices(sim)
-        checks: dict[str, Callable[[Any, str], Any]] = {
-            "law": partial(checked_choice, choices=there["laws"]),
-            "rotations": partial(checked_choice, choices=there["rotations"]),
-            "young": partial(_between, 1.0, 1e12, unit="Pa"),
-            "poisson": partial(_between, 0.0, 0.499),
-            "density": partial(_between, 1.0, 1e5, unit="kg/m^3"),
+        there, now = choices(sim), present(sim)
+        checks: dict[str, Check] = {
+            "law": _one_of(there["laws"]),
+            "rotations": _one_of(there["rotations"]),
+            "young": _between(1.0, 1e12, "Pa"),
+            "poisson": _between(0.0, 0.499),
+            "density": _between(1.0, 1e5, "kg/m^3"),
             "remesh": checked_flag,
             "weight": checked_flag,
         }
-        now = present(sim)
         wanted = now | {name: checks[name](value, name) for name, value in what.items()}
-        gravity, size = session.gravity, session.size
         falls = "weight" not in what and wanted["weight"]
         if falls:
             # Whether bodies would hardly keep their shape under gravity, and did before.
-            shares = [each["density"] * np.linalg.norm(gravity) * size / each["young"] for each in (now, wanted)]
-            before, then = (share > COLLAPSING for share in shares)
+            weight = np.linalg.norm(session.gravity) * session.size
+            before, then = (weight * each["density"] > COLLAPSING * each["young"] for each in (now, wanted))
             falls = bool(then and not (before and now["weight"]))
-        wanted["weight"] &= not falls
+        return wanted | {"weight": wanted["weight"] and not falls}, falls
+
+    def _switch(self, asked: tuple[dict[str, Any], bool]) -> None:
+        (wanted, falls), session = asked, self._session
+        sim = session.sim
         former = [None if each is None else each.options for each in sim.remeshing.changing]
         remesh = [(each or self._options) if wanted["remesh"] else None for each in former]
-
-        def switch() -> None:
-            session.switch(**switched(sim, wanted, gravity), remesh=remesh)
-            if falls:
-                session.note = "So soft a body of this size would collapse under its weight: Weight is off now."
-
-        return switch
+        session.switch(**switched(sim, wanted, session.gravity), remesh=remesh)
+        if falls:
+            session.note = "So soft a body of this size would collapse under its weight: Weight is off now."

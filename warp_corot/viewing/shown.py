@@ -252,19 +252,6 @@ class Source:
     applies: Callable[[SoftBody], bool] = lambda _: True
 
 
-def displacement(sim: Simulation, shown: Shown) -> Values:
-    """The distances of the points from their rest positions [m]."""
-    return np.linalg.norm(shown.positions - shown.rest, axis=1)
-
-
-def contact_pressure(sim: Simulation, shown: Shown) -> Values:
-    """Contact pressure in the last step [Pa]: triangles' values, averaged to nodes by area."""
-    body = shown.body
-    pressure = body.contact_pressure.numpy().reshape(body.worlds, -1)[shown.world.index]
-    nodal = pressure_at_nodes(body.contact_surface, body.world_node_count, pressure)
-    return shown.carried(nodal)
-
-
 def sources() -> dict[str, Source]:
     """The sources by name. Sources that keep data of a body belong to one session."""
     known: dict[SoftBody, tuple[int, VertexAverage]] = {}
@@ -282,12 +269,21 @@ def sources() -> dict[str, Source]:
     def least_stress(shown: Shown) -> float:
         return LEAST_STRESS * float(np.mean(shown.body.material.isotropic.young))
 
+    def contact_pressure(_: Simulation, shown: Shown) -> Values:
+        """Contact pressure in the last step [Pa]: triangles' values, averaged to nodes by area."""
+        body = shown.body
+        pressure = body.contact_pressure.numpy().reshape(body.worlds, -1)[shown.world.index]
+        return shown.carried(pressure_at_nodes(body.contact_surface, body.world_node_count, pressure))
+
+    def moved(_: Simulation, shown: Shown) -> Values:
+        return np.linalg.norm(shown.positions - shown.rest, axis=1)
+
     def stress(sim: Simulation, shown: Shown) -> Values:
         return averages(sim.von_mises(shown.body)[shown.world.elements], shown)
 
     return {
         "stress": Source("von Mises stress", "Pa", stress, least_stress),
-        "displacement": Source("displacement", "m", displacement, least_motion),
+        "displacement": Source("displacement", "m", moved, least_motion),
         "contact pressure": Source(
             "contact pressure", "Pa", contact_pressure, least_stress, lambda body: body.state.is_touched
         ),

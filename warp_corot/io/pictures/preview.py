@@ -218,12 +218,6 @@ def check_film(path: Path) -> None:
         raise InputError(f'{path}: films as .mp4 need: pip install "warp-corot[film]"; a .gif needs no package')
 
 
-def frames_shown(path: Path, frames: list[int], fps: float) -> tuple[list[int], float]:
-    """The frames that a film shows, and their number per second."""
-    every = max(int(np.ceil(fps / GIF_FPS - 1e-9)), 1) if path.suffix.lower() == ".gif" else 1
-    return frames[::every], fps / every
-
-
 def write_film(path: Path, images: Iterator[Image], fps: float) -> None:
     """Write a film, completely or not at all.
 

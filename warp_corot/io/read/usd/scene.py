@@ -87,14 +87,6 @@ def settle_gravity(stage: Any, source: Path) -> list[str]:
     return [str(prim.GetPath()) for prim in scenes]
 
 
-def is_physical(prim: Any) -> bool:
-    """Whether a prim, or something under it, is simulated or collides."""
-    return any(
-        one.IsA(UsdGeom.TetMesh) or one.HasAPI(UsdPhysics.RigidBodyAPI) or one.HasAPI(UsdPhysics.CollisionAPI)
-        for one in Usd.PrimRange(prim, Usd.TraverseInstanceProxies())
-    )
-
-
 def _value(prim: Any, name: str) -> Any:
     for namespace in _NAMESPACES:
         attribute = prim.GetAttribute(f"{namespace}:{name}")
@@ -318,7 +310,9 @@ def _stop_animation(stage: Any) -> tuple[list[str], list[str]]:
         if prim.IsA(UsdGeom.TetMesh):
             attributes += [UsdGeom.TetMesh(prim).GetPointsAttr(), UsdGeom.TetMesh(prim).GetTetVertexIndicesAttr()]
             moves = any(attribute.ValueMightBeTimeVarying() for attribute in attributes)
-        if moves and is_physical(prim):
+        physical = (UsdPhysics.RigidBodyAPI, UsdPhysics.CollisionAPI)
+        below = Usd.PrimRange(prim, Usd.TraverseInstanceProxies()) if moves else ()
+        if any(each.IsA(UsdGeom.TetMesh) or any(map(each.HasAPI, physical)) for each in below):
             stopped.append(str(prim.GetPath()))
         if prim.IsA(UsdGeom.Mesh):
             attributes += [prim.GetAttribute(name) for name in ("points", "faceVertexCounts", "faceVertexIndices")]
