@@ -60,11 +60,11 @@ def example(script, duration, up_axis="Y", azimuth=35.0, elevation=14.0, **optio
             SimpleNamespace(soft=body, subject=SimpleNamespace(mesh=body.mesh, skin=None, surface=None))
             for body in sim.bodies
         ]
-        shown = DrawnBodies(bodies).frame(sim)
+        shown = DrawnBodies(bodies, sim).frame(sim)
         points = shown.positions
         camera = Camera.fit(np.stack([points.min(axis=0), points.max(axis=0)]), up_axis, azimuth, elevation)
         figure = plt.figure(figsize=(6.4, 4.8), layout="constrained")
-        draw_body(figure.subplots(), points, shown.triangles, scalars=shown.values, camera=camera, **options)
+        draw_body(figure.subplots(), points, shown.faces, scalars=shown.scalars, camera=camera, **options)
         return saved(figure)
 
     return draw

@@ -366,3 +366,19 @@ def test_a_body_on_the_ground_shows_what_it_touches_and_is_switched_with_it():
         np.testing.assert_allclose(frame.poses[1][:3], (0.3, 0.0, 0.0))
         page.switch(models=[wc.NeoHookean()])
     assert not session().sources["contact pressure"].applies(session().sim.body)
+
+
+def test_a_visitor_drags_in_implicit_steps():
+    page = Session(block(integrator=wc.BackwardEuler(dt=1 / 60, damping=20.0)))
+    page.ask(lambda: page.press("me", 0, TOP))
+    page.ask(lambda: page.move("me", (0.0, 0.0, 0.004)))
+    page.take_commands()
+    page.sim.advance(0.5)
+    frame = page.frame()
+    assert frame.forces["me"][2] > 0.0
+    page.ask(lambda: page.let_go("me"))
+    page.take_commands()
+    page.sim.advance(2.0)
+    frame = page.frame()
+    assert not frame.forces
+    np.testing.assert_allclose(frame.positions[0], page.shown[0].rest, atol=5e-5)

@@ -3,44 +3,40 @@
 from __future__ import annotations
 
 import argparse
+import functools
 import logging
+import os
 import re
 import shlex
 import sys
+import time
 import warnings
 from collections.abc import Collection, Sequence
 from importlib import import_module
 from importlib.metadata import version
-from types import ModuleType
 from typing import Any, NoReturn
 
 from warp_corot.errors import InputError, UnstableError
 from warp_corot.inputs.arguments import meant
 from warp_corot.inputs.importing import uncollected
+from warp_corot.inputs.processes import process_number
 from warp_corot.inputs.stopwatch import WATCH
 
 from .options import COMMANDS, EXIT_CODES, add_command
 from .terminal import (
+    REPORTED_WITHIN,
     as_option,
     complain,
     end_others,
-    fall_silent,
     interrupt_status,
     leaving_at_once,
-    let_others_speak,
     open_streams,
     silence,
-    speaks,
     terminable,
 )
 
 #: Exit statuses of runs that failed, and not by a signal.
 FAILED = (1, 2, 3)
-
-
-def subcommand(name: str) -> ModuleType:
-    """The module that runs a subcommand; it imports the whole package, which takes a while."""
-    return import_module(f".{name.replace('-', '_')}", __name__)
 
 
 class Parser(argparse.ArgumentParser):
@@ -112,9 +108,9 @@ def main(argv: Sequence[str] | None = None, spent: float = 0.0) -> int:
     """
     WATCH.begin("importing", spent)
     open_streams()
-    is_silent = not speaks()
-    if is_silent:
-        fall_silent()
+    is_silent = process_number() > 0
+    if is_silent:  # from here on: rank 0 prints for all ranks
+        sys.stdout = sys.stderr = open(os.devnull, "w")  # noqa: SIM115 (open as long as the process lives)
     status: object = None
     try:
         status = found = _main(argv)
@@ -127,7 +123,7 @@ def main(argv: Sequence[str] | None = None, spent: float = 0.0) -> int:
 
             give_up(settled=True)
         if is_silent and status in FAILED:
-            let_others_speak()
+            time.sleep(REPORTED_WITHIN)  # `mpirun` ends all others then; rank 0 first reports the error
     if found in FAILED and not is_silent:
         end_others(found)
     return found
@@ -139,8 +135,9 @@ def _main(argv: Sequence[str] | None) -> int:
             stream.reconfigure(errors="backslashreplace")
     try:
         with terminable(), warnings.catch_warnings():
-            said: set[str] = set()
-            warnings.showwarning = lambda message, *_, **__: _warn(str(message), said)
+            # Each warning is printed once.
+            once = functools.cache(lambda message: complain(as_option(message), kind="warning"))
+            warnings.showwarning = lambda message, *_, **__: once(str(message))
             status = _run(argv)
             sys.stdout.flush()
         return status
@@ -162,22 +159,6 @@ def _main(argv: Sequence[str] | None) -> int:
         return 1
 
 
-def _warn(message: str, said: set[str]) -> None:
-    """Print a warning, once."""
-    if message not in said:
-        said.add(message)
-        complain(as_option(message), kind="warning")
-
-
-def configure_warp() -> None:
-    """Set Warp's options, before it starts."""
-    import warp as wp
-
-    wp.config.log_level = wp.LOG_ERROR  # so that it prints no banner
-    # The command differentiates nothing, and Newton's kernels compile in a third of the time without adjoints.
-    wp.config.enable_backward = False
-
-
 def _run(argv: Sequence[str] | None) -> int:
     words = sys.argv[1:] if argv is None else list(argv)
     named = [word for word in words if not word.startswith("-")][:1]
@@ -186,8 +167,13 @@ def _run(argv: Sequence[str] | None) -> int:
     with leaving_at_once(), uncollected():
         args = make_parser(tuple(named)).parse_args(words)
         args.command_line = shlex.join(["warp-corot", *words])
-        configure_warp()
+        import warp as wp
+
         from warp_corot.inputs.processes import start_warp
+
+        wp.config.log_level = wp.LOG_ERROR  # so that it prints no banner
+        # The command differentiates nothing, and Newton's kernels compile in a third of the time without adjoints.
+        wp.config.enable_backward = False
 
         logging.basicConfig(format="warp-corot: warning: %(message)s", level=logging.WARNING)
         try:
@@ -202,6 +188,7 @@ def _run(argv: Sequence[str] | None) -> int:
             from .terminal import begin_compiling
 
             begin_compiling(args.device)
-        module = subcommand(args.command)
+        # This imports the whole package, which takes a while.
+        module = import_module(f".{args.command.replace('-', '_')}", __name__)
     WATCH.switch("preparing")
     return module.run(args)

@@ -20,9 +20,9 @@ from warp_corot.remesh.remeshing import OnlineRemesh
 from warp_corot.simulation.parts import checked_gravity
 
 from .input_file import InputFile, bodies_in, open_input, refuse_options, with_unit
-from .input_mesh import InputMesh, covers_all, find_organ, find_subject, mixed_material, region_entries
-from .options import is_static
-from .patches import BodyPatches, Load, loads_of, move_patches, probes_body, ramp_of, up_of
+from .input_mesh import InputMesh, find_organ, find_subject, mixed_material, region_entries
+from .options import STIFFNESS_PER_WEIGHT, is_static
+from .patches import BodyPatches, Load, loads_of, move_patches, ramp_of, up_of
 
 #: A density below this [kg/m^3] is most likely meant in g/cm^3.
 LIGHT = 5.0
@@ -88,7 +88,7 @@ def find_patches(bodies: Sequence[RunBody]) -> None:
         body.loads, body.probes = loads, probes
         if len(bodies) > 1:
             body.loads = [load for load in loads if body.patches.nodes(load.patch).any()]
-            body.probes = [text for text in probes if probes_body(text, body.patches)]
+            body.probes = [text for text in probes if body.patches.has(text)]
     for load in loads:
         if not any(load in body.loads for body in bodies):
             raise InputError(f"--{load.kind} {load.patch!r}: there are no nodes in it")
@@ -102,7 +102,8 @@ def make_body(body: RunBody, duration: float, *, alone: bool) -> None:
     args, subject = body.args, body.subject
     gravity = gravity_of(args, subject)
     material, chosen = _material(args, subject, body.patches)
-    free = stands_free(args)
+    # A ground carries the body in place of fixed nodes.
+    free = args.fix is None and (args.ground is not None or args.drop is not None)
     expressions = ["none"] if free else args.fix
     if expressions is None and subject.fix is not None:
         expressions = [subject.fix]
@@ -115,7 +116,13 @@ def make_body(body: RunBody, duration: float, *, alone: bool) -> None:
             material, chosen = _material(args, subject, body.patches, stiffer)
     else:
         moved = any(load.kind != "press" for load in body.loads)
-        body.held = held_as_told(subject, body.patches, expressions, moved or free)
+        nodes = np.logical_or.reduce([body.patches.nodes(expression) for expression in expressions])
+        said = " or ".join(expressions)
+        if nodes.sum() == len(subject.used):
+            raise InputError(f"expression {said!r}: holds all {nodes.sum()} nodes; at least one must be free to move")
+        if not nodes.any() and not (moved or free):
+            subject.notes.append(f"no node is held ({said!r}): the body falls freely")
+        body.held = FixedNodes(nodes, f"held where {said}" if nodes.any() else "free, nothing is held")
         if free:
             subject.notes.append("the ground carries the body, and nothing is fixed (--fix)")
     if chosen is not None:
@@ -132,11 +139,6 @@ def make_body(body: RunBody, duration: float, *, alone: bool) -> None:
         subject.notes.append(
             f"--density is {args.density:g} kg/m^3, far less than water; write {args.density:g}g/cm3 for g/cm^3"
         )
-
-
-def stands_free(args: argparse.Namespace) -> bool:
-    """Whether a ground carries the body in place of fixed nodes."""
-    return args.fix is None and (args.ground is not None or args.drop is not None)
 
 
 def gravity_of(args: argparse.Namespace, subject: InputMesh) -> np.ndarray:
@@ -166,12 +168,17 @@ def _material(
     poisson = subject.poisson if args.poisson is None else args.poisson
     Isotropic(1.0, poisson, density)  # both must be checked before they are used
     young = subject.young if args.young is None else args.young
-    covered = bool(subject.labels) and covers_all(subject.mesh, subject.labels)
+    mesh, named = subject.mesh, {entry.name for entry in subject.labels}
+    there = np.unique(mesh.labels).tolist() if named and mesh.labels is not None else []
+    covered = bool(named) and all(number and mesh.label_names[number - 1] in named for number in there)
     if covered and args.young is not None:
         raise InputError("--young is given, but --materials gives each label its own")
     chosen = None
     if young is None:
-        young = float(f"{stiffer * subject.young_from_weight(density, args.gravity):.1e}")
+        # The body sags visibly, and stands; to two digits.
+        g = 9.81 if args.gravity is None else float(np.linalg.norm(args.gravity)) or 9.81
+        young = float(f"{STIFFNESS_PER_WEIGHT * density * g * subject.height:.1e}")
+        young = float(f"{stiffer * young:.1e}")
         chosen = None if covered else young
     material = Isotropic(young, poisson, density)
     mixed = [(subject.mesh.elements_of(entry.name), entry) for entry in subject.labels]
@@ -206,29 +213,6 @@ class FixedNodes:
     @property
     def count(self) -> int:
         return int(self.nodes.sum())
-
-
-def held_as_told(subject: InputMesh, patches: BodyPatches, expressions: Sequence[str], pulled: bool) -> FixedNodes:
-    """The nodes of ``--fix``, from all its patches.
-
-    Args:
-        subject: Gets a note if no node is fixed.
-        patches: The body's patches.
-        expressions: One or several expressions.
-        pulled: Whether another option moves nodes.
-
-    Raises:
-        InputError: A bad expression, or no node is left free.
-    """
-    nodes = np.logical_or.reduce([patches.nodes(expression) for expression in expressions])
-    said = " or ".join(expressions)
-    if nodes.sum() == len(patches.used):
-        raise InputError(f"expression {said!r}: holds all {nodes.sum()} nodes; at least one must be free to move")
-    if not nodes.any():
-        if not pulled:
-            subject.notes.append(f"no node is held ({said!r}): the body falls freely")
-        return FixedNodes(nodes, "free, nothing is held")
-    return FixedNodes(nodes, f"held where {said}")
 
 
 def held_by_default(

@@ -18,7 +18,6 @@ from warp_corot.contact.options import Contact, checked_friction
 from warp_corot.contact.shapes import Box, Capsule, Cylinder, Ground, Shape, Sphere, axis_of
 from warp_corot.contact.skin import own_surface
 from warp_corot.contact.tool import Obstacle, Tool
-from warp_corot.cutting.blade import Blade
 from warp_corot.domain.units import in_units, length
 from warp_corot.errors import InputError
 from warp_corot.solvers import INTEGRATORS
@@ -76,12 +75,7 @@ def tool_shape(text: str) -> Shape:
         raise InputError(f"--tool {text!r}: {error}; it must be {FORMS}") from None
 
 
-def make_blade(path: Path, length: float) -> Blade:
-    """A straight blade of this length [m] that moves along the path in a file; see ``_moved``."""
-    return _moved(Blade([(0.0, 0.0, -0.5 * length), (0.0, 0.0, 0.5 * length)]), path)
-
-
-def _moved(tool: AnyTool, path: Path) -> AnyTool:
+def moved(tool: AnyTool, path: Path) -> AnyTool:
     """A tool that moves along the path in a file; with a single row it stays there.
 
     Raises:
@@ -186,7 +180,14 @@ class RunContact:
         """Lines of the summary."""
         if self.contact is None:
             return []
-        found = [f"{name}: {_described(each)}" for name, each in self.obstacles.items()]
+        found = []
+        for name, each in self.obstacles.items():
+            shape, moves = (each.shape, each.keys is not None) if isinstance(each, Tool) else (each, False)
+            sizes = ", ".join(length(size) for size in shape.size if size > 0.0)
+            said = f"{shape!r} ({sizes}), {'moves along its path' if moves else 'stays where it is'}"
+            if isinstance(shape, Ground):
+                said = f"at {float(axis_of(shape.quaternion) @ shape.position) + 0.0:.4g} m"
+            found.append(f"{name}: {said}")
         found.append("themselves and one another" if self.contact.self_contact else "one another")
         found[-1] += f"; friction {self.contact.friction:g}"
         return [("touches" if place == 0 else "", text) for place, text in enumerate(found)]
@@ -207,7 +208,13 @@ def touched_by(options: Sequence[argparse.Namespace]) -> RunContact:
         raise InputError(
             f"--tool is given {len(shapes)} times and --tool-path {len(paths)} times; each tool must have one path"
         )
-    _check_drop(options)
+    if shared.drop is not None:
+        if not 0.0 < shared.drop < math.inf:
+            raise InputError(f"--drop is {shared.drop:g} m; it must be a positive height")
+        if isinstance(shared.ground, float):
+            raise InputError("--drop puts the ground below the bodies; --ground must be auto then, or left out")
+        if any(each.fix not in (None, ["none"]) for each in options):
+            raise InputError("--drop lets the bodies fall; --fix must be none then, or left out")
     if shared.no_ground and (shared.ground is not None or shared.drop is not None):
         raise InputError("--no-ground is given with --ground or --drop, which put a ground below the bodies")
     touches = bool(shapes) or shared.ground is not None or shared.drop is not None
@@ -219,24 +226,12 @@ def touched_by(options: Sequence[argparse.Namespace]) -> RunContact:
     if isinstance(shared.ground, float) and not math.isfinite(shared.ground):
         raise InputError(f"--ground is {shared.ground:g} m; it must be a finite height or auto")
     tools: dict[str, Obstacle] = {
-        f"tool {place}": _moved(Tool(tool_shape(shape)), path)
+        f"tool {place}": moved(Tool(tool_shape(shape)), path)
         for place, (shape, path) in enumerate(zip(shapes, paths, strict=True), 1)
     }
     friction = Contact().friction if shared.friction is None else shared.friction
     contact = Contact(friction=friction, self_contact=shared.self_contact)
     return RunContact(contact if touches else None, tools)
-
-
-def _check_drop(options: Sequence[argparse.Namespace]) -> None:
-    shared = options[0]
-    if shared.drop is None:
-        return
-    if not 0.0 < shared.drop < math.inf:
-        raise InputError(f"--drop is {shared.drop:g} m; it must be a positive height")
-    if isinstance(shared.ground, float):
-        raise InputError("--drop puts the ground below the bodies; --ground must be auto then, or left out")
-    if any(each.fix not in (None, ["none"]) for each in options):
-        raise InputError("--drop lets the bodies fall; --fix must be none then, or left out")
 
 
 def place_ground(touched: RunContact, args: argparse.Namespace, bodies: Sequence[RunBody], gravity: Floats) -> None:
@@ -280,12 +275,3 @@ def say_reach(bodies: Sequence[RunBody], sim: Simulation) -> None:
                 f"contact acts on the tetrahedra, which reach {length(mean)} beyond the surface on average and "
                 f"{length(most)} at most; more tetrahedra (--tets) reach less far"
             )
-
-
-def _described(obstacle: Obstacle) -> str:
-    shape = obstacle.shape if isinstance(obstacle, Tool) else obstacle
-    if isinstance(shape, Ground):
-        return f"at {float(axis_of(shape.quaternion) @ shape.position) + 0.0:.4g} m"
-    moves = isinstance(obstacle, Tool) and obstacle.keys is not None
-    sizes = ", ".join(length(size) for size in shape.size if size > 0.0)
-    return f"{shape!r} ({sizes}), {'moves along its path' if moves else 'stays where it is'}"

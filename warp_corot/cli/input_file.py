@@ -13,7 +13,7 @@ import numpy.typing as npt
 from warp_corot.domain.units import length, likely_unit, metres_per_unit, unlikely_size
 from warp_corot.errors import InputError
 from warp_corot.io.read import FileMesh
-from warp_corot.io.read.filemesh import LoadedVolume, volume_of_image
+from warp_corot.io.read.filemesh import LoadedVolume
 from warp_corot.io.read.meshes import (
     Asset,
     LoadedMesh,
@@ -54,11 +54,6 @@ class InputFile:
         """The file."""
         return self.asset.path if self.asset else Path(self.name)
 
-    @property
-    def has_regions(self) -> bool:
-        """Whether its cells have numbers that may distinguish regions."""
-        return self.found is not None and any(block.data for block in self.found.solids)
-
 
 def open_input(name: str) -> InputFile:
     """Read the input.
@@ -77,7 +72,7 @@ def open_input(name: str) -> InputFile:
         check_file(path, "mesh")
     found = read_file(path)
     if not isinstance(found, FileMesh):
-        return InputFile(name, "scan", loaded=volume_of_image(path, found))
+        return InputFile(name, "scan", loaded=found)
     if found.solids:
         return InputFile(name, "tets", asset, found)
     if found.faces:
@@ -166,7 +161,8 @@ def refuse_options(args: argparse.Namespace, opened: InputFile) -> None:
     Raises:
         InputError: An option has none; the message names it and its purpose.
     """
-    is_scan, regions = opened.kind == "scan", opened.has_regions
+    is_scan = opened.kind == "scan"
+    regions = opened.found is not None and any(block.data for block in opened.found.solids)
     is_organ, is_forest = opened.kind in ("surface", "scan"), opened.kind != "tets"
     organs, forests, numbered = "surfaces and scans", "box, surfaces and scans", "tetrahedra whose file numbers regions"
     rules = {

@@ -22,7 +22,7 @@ from warp_corot.mesh import TetForest, TetMesh
 from warp_corot.mesh.lattice import checked_level
 
 from .input_file import InputFile, merged_nodes, offset_of, placed
-from .options import BOX_LEVEL, CUBES_OF_LEVEL, LABEL, STIFFNESS_PER_WEIGHT, TETS
+from .options import BOX_LEVEL, CUBES_OF_LEVEL, LABEL, TETS
 
 if TYPE_CHECKING:
     from warp_corot.domain import Domain
@@ -34,6 +34,9 @@ if TYPE_CHECKING:
 
 #: The box, the beam of Tagawa et al. 2013: its cubes, and their edge [m].
 CELLS, CELL_SIZE = (1, 1, 3), 0.064
+#: Its defaults.
+BOX: dict[str, Any] = {"young": 500.0, "poisson": 0.49, "density": 10.0, "fix": "z <= zmin"}
+BOX |= {"gravity": (0.0, -9.8, 0.0), "damping": 15.0, "duration": 4.0}
 
 
 @dataclass
@@ -95,11 +98,6 @@ class InputMesh:
         lowest, highest = self.bounds[:, "XYZ".index(self.mesh.up_axis)]
         return float(highest - lowest)
 
-    def young_from_weight(self, density: float, gravity: tuple[float, float, float] | None) -> float:
-        """Young's modulus [Pa] with which the body sags visibly and stands, to two digits."""
-        g = 9.81 if gravity is None else float(np.linalg.norm(gravity)) or 9.81
-        return float(f"{STIFFNESS_PER_WEIGHT * density * g * self.height:.1e}")
-
     def take(self, asset: Asset, args: argparse.Namespace) -> None:
         """Use an asset's defaults, as far as they suit the options: its fixed nodes support a body of its size
         that is at least as stiff as the asset."""
@@ -124,18 +122,25 @@ def find_subject(opened: InputFile, args: argparse.Namespace) -> InputMesh:
     if opened.kind == "box":
         level = BOX_LEVEL if args.level is None else args.level
         x, y, z = offset_of(args).tolist()
-        return box_subject(TetForest.box(CELLS, CELL_SIZE * (args.scale or 1.0), level, origin=(x, y, z)))
+        box = TetForest.box(CELLS, CELL_SIZE * (args.scale or 1.0), level, origin=(x, y, z))
+        return InputMesh(box, "box", **BOX)
     loaded: LoadedMesh = placed(opened, args)
     points, tets = loaded.points, loaded.cells
     sets = {name: np.isin(np.arange(len(points)), nodes) for name, nodes in loaded.node_sets.items()}
     if args.join:
-        points, tets, sets = _joined(loaded, sets, opened.notes)
+        points, tets, place = merged_nodes(loaded.points, loaded.cells)
+        if merged := len(place) - len(points):
+            opened.notes.append(f"{merged} nodes coincide with others and are merged")
+        elif not loaded.objects:
+            raise InputError(f"{loaded.source}: no two nodes coincide, so that --join has no effect")
+        sets = {name: np.bincount(place, mask, len(points)) > 0 for name, mask in sets.items()}
     entries, found = parse_labels(args.materials, "--materials") if args.materials else [], loaded.regions
+    names, labels = tuple[str, ...](), None
     try:
         if entries and found is None:
             raise InputError("its arrays number no regions, so that --materials has no effect")
-        names, entries = of_regions(entries, found) if found is not None else ((), entries)
-        labels = None if found is None else found.of_tet
+        if found is not None:
+            (names, entries), labels = of_regions(entries, found), found.of_tet
         mesh = TetMesh(points, tets, up_axis=loaded.up_axis or "Z", labels=labels, label_names=names, node_sets=sets)
     except InputError as error:
         raise InputError(f"{loaded.source}: {error}") from None
@@ -154,40 +159,8 @@ def find_subject(opened: InputFile, args: argparse.Namespace) -> InputMesh:
     return subject
 
 
-def _joined(
-    loaded: LoadedMesh, sets: dict[str, np.ndarray], notes: list[str]
-) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
-    """Points, tetrahedra and node sets, with coincident nodes merged.
-
-    Raises:
-        InputError: There are no coincident nodes.
-    """
-    points, tets, place = merged_nodes(loaded.points, loaded.cells)
-    merged = len(place) - len(points)
-    if not merged and not loaded.objects:
-        raise InputError(f"{loaded.source}: no two nodes coincide, so that --join has no effect")
-    if merged:
-        notes.append(f"{merged} nodes coincide with others and are merged")
-    return points, tets, {name: np.bincount(place, mask, len(points)) > 0 for name, mask in sets.items()}
-
-
 def _listed(names: Sequence[str]) -> str:
     return ", ".join(names[:12]) + (", ..." if len(names) > 12 else "")
-
-
-def box_subject(mesh: TetForest) -> InputMesh:
-    """A box with its defaults."""
-    return InputMesh(
-        mesh,
-        "box",
-        young=500.0,
-        poisson=0.49,
-        density=10.0,
-        fix="z <= zmin",
-        gravity=(0.0, -9.8, 0.0),
-        damping=15.0,
-        duration=4.0,
-    )
 
 
 # --- surfaces and scans, which have no tetrahedra --------------------------------------------------------------------
@@ -212,15 +185,39 @@ def find_organ(opened: InputFile, args: argparse.Namespace) -> InputMesh:
     """
     started = WATCH.clock()
     entries: list[LabelMaterial] = []
-    domain = domain_of(opened, args, entries)
+    from warp_corot.domain import Domain
+    from warp_corot.domain.fidelity import fidelity
+    from warp_corot.io.write.skins import OwnSurface
+
+    if opened.kind == "scan":
+        domain = _scan(opened, args, entries)
+    else:
+        domain = Domain.from_surface(placed(opened, args), unit=opened.unit, device=args.device)
     meshing = WATCH.clock()
-    mesh = _mesh(args, domain)
+    if args.level is not None:
+        checked_level(args.level, "--level")
+        size = float(np.ptp(domain.bounds, axis=0).max()) * (1.0 + MARGIN) / CUBES_OF_LEVEL
+        mesh = TetForest.from_domain(domain, size, max_level=args.level, device=args.device)
+    else:
+        count = TETS if args.tets is None else args.tets
+        layers = {} if args.min_layers is None else {"min_layers": args.min_layers}
+        try:
+            mesh = TetForest.from_domain(domain, target_elements=count, device=args.device, **layers)
+        except InputError as error:
+            said = count < 1 or "target_elements" in str(error)
+            raise InputError(f"{'' if said else f'with --tets {count}, '}{error}") from None
     surface = mesh.surface()
     done = WATCH.clock()
-    measured = _measured(mesh, domain, surface)
-    skin = _own_surface(opened, args, domain)
+    measured, skin = fidelity(mesh, domain, surface=surface), None
+    for doubt in measured.doubts():
+        said = doubt.replace("more tetrahedra", f"more tetrahedra (--tets {2 * len(mesh.tets)})")
+        warnings.warn(said, stacklevel=2)
     asset, loaded = opened.asset, opened.loaded
     assert loaded is not None
+    if isinstance(loaded, LoadedMesh) and args.skin != "marched":
+        skin = OwnSurface.of_domain(opened.source, loaded, domain.bounds, offset_of(args))
+        if skin is None:
+            opened.notes.append("the surface was changed when it was closed: the marched one is drawn")
     subject = InputMesh(
         mesh,
         loaded.name.encode(errors="replace").decode(),
@@ -236,15 +233,6 @@ def find_organ(opened: InputFile, args: argparse.Namespace) -> InputMesh:
     if asset:
         subject.take(asset, args)
     return subject
-
-
-def domain_of(opened: InputFile, args: argparse.Namespace, entries: list[LabelMaterial]) -> Domain:
-    """The domain of a surface or a scan; ``entries`` are filled with the materials of its labels."""
-    from warp_corot.domain import Domain
-
-    if opened.kind == "scan":
-        return _scan(opened, args, entries)
-    return Domain.from_surface(placed(opened, args), unit=opened.unit, device=args.device)
 
 
 def _scan(opened: InputFile, args: argparse.Namespace, entries: list[LabelMaterial]) -> Domain:
@@ -269,68 +257,25 @@ def _scan(opened: InputFile, args: argparse.Namespace, entries: list[LabelMateri
         inside = (volume.values >= args.threshold.low) & (volume.values <= args.threshold.high)
         volume = replace(volume, values=inside.astype(np.uint8))
     else:
-        _see_labels(volume)
+        values = np.ravel(volume.values)
+        there = np.unique(values[:: max(1, len(values) // LOOKED_AT)])
+        fractions, cure = (
+            there[there != np.round(there)],
+            "give --threshold LOW[:HIGH] for the voxels that make up the body",
+        )
+        if len(fractions):
+            raise InputError(
+                f"{volume.source}: has values such as {fractions[0]:g}, as probabilities and intensities do, not "
+                f"labels; {cure}"
+            )
+        if np.isfinite(there).all() and (len(there) > MOST_LABELS or there[0] < 0):
+            raise InputError(
+                f"{volume.source}: has {len(there)} different values or more, {there[0]:g} to {there[-1]:g}, as "
+                f"intensities do, not labels; {cure}, or --labels"
+            )
     smoothing = args.smoothing or 0.0
     up = args.up or "Z"
     return Domain.from_labels(volume, labels=numbers, unit=unit, smoothing=smoothing, up_axis=up, device=args.device)
-
-
-def _see_labels(volume: LoadedVolume) -> None:
-    """Check that a scan holds labels.
-
-    Raises:
-        InputError: It holds intensities.
-    """
-    values = np.ravel(volume.values)
-    found = np.unique(values[:: max(1, len(values) // LOOKED_AT)])
-    fractions = found[found != np.round(found)]
-    if len(fractions):
-        raise InputError(
-            f"{volume.source}: has values such as {fractions[0]:g}, as probabilities and intensities do, not labels; "
-            "give --threshold LOW[:HIGH] for the voxels that make up the body"
-        )
-    if np.isfinite(found).all() and (len(found) > MOST_LABELS or found[0] < 0):
-        raise InputError(
-            f"{volume.source}: has {len(found)} different values or more, {found[0]:g} to {found[-1]:g}, as "
-            "intensities do, not labels; give --threshold LOW[:HIGH] for the voxels that make up the body, or --labels"
-        )
-
-
-def _mesh(args: argparse.Namespace, domain: Domain) -> TetForest:
-    if args.level is not None:
-        checked_level(args.level, "--level")
-        size = float(np.ptp(domain.bounds, axis=0).max()) * (1.0 + MARGIN) / CUBES_OF_LEVEL
-        return TetForest.from_domain(domain, size, max_level=args.level, device=args.device)
-    count = TETS if args.tets is None else args.tets
-    layers = {} if args.min_layers is None else {"min_layers": args.min_layers}
-    try:
-        return TetForest.from_domain(domain, target_elements=count, device=args.device, **layers)
-    except InputError as error:
-        said = count < 1 or "target_elements" in str(error)
-        raise InputError(f"{'' if said else f'with --tets {count}, '}{error}") from None
-
-
-def _own_surface(opened: InputFile, args: argparse.Namespace, domain: Domain) -> OwnSurface | None:
-    """The input surface, if it is to be drawn."""
-    if not isinstance(opened.loaded, LoadedMesh) or args.skin == "marched":
-        return None
-    from warp_corot.io.write.skins import OwnSurface
-
-    found = OwnSurface.of_domain(opened.source, opened.loaded, domain.bounds, offset_of(args))
-    if found is None:
-        opened.notes.append("the surface was changed when it was closed: the marched one is drawn")
-    return found
-
-
-def _measured(mesh: TetForest, domain: Domain, surface: SurfaceMesh) -> Fidelity:
-    """Measure how well the mesh approximates the body, and warn of deviations."""
-    from warp_corot.domain.fidelity import fidelity
-
-    found = fidelity(mesh, domain, surface=surface)
-    for doubt in found.doubts():
-        said = doubt.replace("more tetrahedra", f"more tetrahedra (--tets {2 * len(mesh.tets)})")
-        warnings.warn(said, stacklevel=2)
-    return found
 
 
 # --- materials by label or region ------------------------------------------------------------------------------------
@@ -454,13 +399,6 @@ def of_regions(entries: Sequence[LabelMaterial], regions: Regions) -> tuple[tupl
             taken[place] = entry.name
             found.append(replace(entry, name=names[place]))
     return tuple(names), found
-
-
-def covers_all(mesh: TetForest | TetMesh, entries: Sequence[LabelMaterial]) -> bool:
-    """Whether each element's label has an entry."""
-    assert mesh.labels is not None
-    named = {entry.name for entry in entries}
-    return all(number and mesh.label_names[number - 1] in named for number in np.unique(mesh.labels).tolist())
 
 
 def region_entries(

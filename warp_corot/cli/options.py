@@ -8,7 +8,7 @@ from __future__ import annotations
 import argparse
 import re
 from collections.abc import Callable, Sequence
-from functools import cache, partial
+from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -318,7 +318,9 @@ def _option(line: str) -> Option:
     if kind == "flag":
         return Option(dest, (f"--{name}",), settings | {"action": "store_true", "default": False})
     if "|" in kind:
-        settings |= {"choices": kind.split("|"), "type": partial(_as_listed, tuple(kind.split("|")))}
+        words = kind.split("|")  # in any case
+        listed = {word.lower(): word for word in words}
+        settings |= {"choices": words, "type": lambda text: listed.get(text.lower(), text)}
     else:
         settings["type"] = KINDS[kind] if kind in KINDS else quantity(kind)
     if name.isupper():
@@ -334,11 +336,6 @@ def _option(line: str) -> Option:
         else {"default": KINDS.get(kind, str if "|" in kind else float)(default) if default else None}
     )
     return Option(dest, (*short.split(), f"--{name}"), settings)
-
-
-def _as_listed(words: Sequence[str], text: str) -> str:
-    """The word of a list that a text is in another case, or the text."""
-    return next((word for word in words if word.lower() == text.lower()), text)
 
 
 def options_of(groups: Sequence[str]) -> list[Option]:

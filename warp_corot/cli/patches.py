@@ -37,6 +37,7 @@ if TYPE_CHECKING:
 _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 POINT = re.compile(rf"\s*({_NUMBER})[\s,]+({_NUMBER})[\s,]+({_NUMBER})\s*")
 Mask = npt.NDArray[np.bool_]
+Array = npt.NDArray[np.float64]
 
 
 class BodyPatches:
@@ -51,7 +52,7 @@ class BodyPatches:
         InputError: Another form, or an invalid name.
     """
 
-    def __init__(self, subject: InputMesh, up: npt.NDArray[np.float64], given: Sequence[str] = ()):
+    def __init__(self, subject: InputMesh, up: Array, given: Sequence[str] = ()):
         self.subject = subject
         self.used = subject.used
         self._up, self._given = up, given
@@ -83,10 +84,15 @@ class BodyPatches:
         Raises:
             InputError: As in `select_nodes`.
         """
-        mesh, mask = self.subject.mesh, np.zeros(len(self.subject.mesh.points), bool)
-        points = mesh.points[self.used]
-        mask[self.used] = select_nodes(expression, points, bounds=self.subject.bounds, named=self._named)
+        points = self.subject.mesh.points
+        mask = np.zeros(len(points), bool)
+        mask[self.used] = self._selected(expression, points[self.used], lambda own: own)
         return mask
+
+    def _selected(self, expression: str, points: Array, convert: Callable[[Mask], Mask]) -> Mask:
+        """The points of a patch; ``convert`` makes a mask of points from one of the used nodes."""
+        named = {name: lambda own=own: convert(own()) for name, own in self._named.items()}
+        return select_nodes(expression, points, bounds=self.subject.bounds, named=named)
 
     def some(self, expression: str, option: str) -> Mask:
         """Nodes of a patch that must not be empty.
@@ -110,8 +116,7 @@ class BodyPatches:
         """
         tets, mesh = self.subject.mesh.tets, self.subject.mesh
         places = np.searchsorted(self.used, tets)
-        middles = {name: lambda nodes=nodes: nodes()[places].all(axis=1) for name, nodes in self._named.items()}
-        return select_nodes(expression, mesh.points[tets].mean(axis=1), bounds=self.subject.bounds, named=middles)
+        return self._selected(expression, mesh.points[tets].mean(axis=1), lambda own: np.all(own[places], axis=1))
 
     def on_surface(self, expression: str, surface: SurfaceMesh) -> Mask:
         """Points of a bound surface that are in a patch, bool [V]; for named patches, those bound to it by half or
@@ -120,8 +125,25 @@ class BodyPatches:
         Raises:
             InputError: As in `select_nodes`.
         """
-        named = {name: partial(self._bound, nodes, surface) for name, nodes in self._named.items()}
-        return select_nodes(expression, surface.points, bounds=self.subject.bounds, named=named)
+        inside = np.zeros(len(self.subject.mesh.points), bool)
+
+        def bound(own: Mask) -> Mask:
+            inside[self.used] = own
+            return np.einsum("vn,vn->v", surface.weights, inside[surface.nodes]) >= 0.5
+
+        return self._selected(expression, surface.points, bound)
+
+    def has(self, probe: str) -> bool:
+        """Whether the patch of ``--probe`` has nodes, or the box around the body contains its point.
+
+        Raises:
+            InputError: As in `nodes`.
+        """
+        match = POINT.fullmatch(probe)
+        if match is None:
+            return bool(self.nodes(probe).any())
+        point, (low, high) = np.array([float(part) for part in match.groups()]), self.subject.bounds
+        return bool(((low <= point) & (point <= high)).all())
 
     @cached_property
     def shape(self) -> BodyShape:
@@ -131,7 +153,7 @@ class BodyPatches:
             return BodyShape(mesh.points, self.used, surface.points, surface.triangles, self._up)
         return BodyShape(mesh.points, self.used, mesh.points, boundary_faces(mesh.tets, mesh.points)[0], self._up)
 
-    def _end(self, way: npt.NDArray[np.float64]) -> Mask:
+    def _end(self, way: Array) -> Mask:
         return np.isin(self.used, self.shape.beyond(way, LOWEST))
 
     def _flat(self) -> Mask:
@@ -140,26 +162,8 @@ class BodyPatches:
             raise InputError(f"{self.subject.name}: no region of its surface is flat")
         return np.isin(self.used, patch.nodes)
 
-    def _bound(self, nodes: Callable[[], Mask], surface: SurfaceMesh) -> Mask:
-        inside = np.zeros(len(self.subject.mesh.points), bool)
-        inside[self.used] = nodes()
-        return np.einsum("vn,vn->v", surface.weights, inside[surface.nodes]) >= 0.5
 
-
-def probes_body(text: str, patches: BodyPatches) -> bool:
-    """Whether a body has the patch, or contains the point in its box.
-
-    Raises:
-        InputError: As in `BodyPatches.nodes`.
-    """
-    match = POINT.fullmatch(text)
-    if match is None:
-        return bool(patches.nodes(text).any())
-    point, (low, high) = np.array([float(part) for part in match.groups()]), patches.subject.bounds
-    return bool(((low <= point) & (point <= high)).all())
-
-
-def up_of(subject: InputMesh, gravity: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+def up_of(subject: InputMesh, gravity: Array) -> Array:
     """The unit vector against gravity; the mesh's up axis without gravity."""
     if not gravity.any():
         return np.eye(3)["XYZ".index(subject.mesh.up_axis)]
@@ -172,8 +176,6 @@ def up_of(subject: InputMesh, gravity: npt.NDArray[np.float64]) -> npt.NDArray[n
 UNITS = {"pull": "m", "twist": "degree", "press": "Pa"}
 #: Largest angle between keyframes of a twist [degrees]: nodes move straight in between.
 KEY_ANGLE = 5.0
-
-Array = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -251,9 +253,7 @@ def value_of(kind: str, text: str) -> float:
     return value
 
 
-def move_patches(
-    body: SoftBody, loads: Sequence[Load], patches: BodyPatches, ramp: float, fixed: npt.NDArray[np.bool_] | None
-) -> None:
+def move_patches(body: SoftBody, loads: Sequence[Load], patches: BodyPatches, ramp: float, fixed: Mask | None) -> None:
     """Prescribe the motion of the patches of ``--pull`` and ``--twist``.
 
     Args:
@@ -291,9 +291,7 @@ def move_patches(
         raise InputError("all nodes are moved by options; at least one must be free to move")
 
 
-def _turned(
-    load: Load, patches: BodyPatches, mask: npt.NDArray[np.bool_], times: Array, shares: Array
-) -> tuple[Array, Array]:
+def _turned(load: Load, patches: BodyPatches, mask: Mask, times: Array, shares: Array) -> tuple[Array, Array]:
     """Keyframes of a twist: times [K], and displacements [K, n, 3]."""
     axis = (
         -pressed(load, patches, surface_of(patches)).sum(axis=0)
@@ -337,56 +335,33 @@ def press_patches(sim: Simulation, body: SoftBody, loads: Sequence[Load], patche
     pressing = [load for load in loads if load.kind == "press"]
     if not pressing:
         return
-    pressure = _Pressure(body, pressing, patches, ramp)
-    pressure.set(0.0)
-    sim.on_step(lambda sim: pressure.set(sim.time), every=max(1, int(pressure.span / UPDATES / sim.dt)))
+    surface, curves = surface_of(patches), [load.curve(ramp) for load in pressing]
+    forces = [load.values[0] * pressed(load, patches, surface) for load in pressing]
+    there = np.any([each.any(axis=1) for each in forces], axis=0)
+    of_points = np.stack([each[there] for each in forces])
+    following = None if body.changing is None else body.bind(surface.points[there])
+    first, last = min(times[0] for times, _ in curves), max(times[-1] for times, _ in curves)
+    # The version of the mesh and whether pressures have their last values there, and points bound to its nodes.
+    version, is_done = -1, False
+    nodes, weights = surface.nodes[there], surface.weights[there]
+
+    def update(time: float) -> None:
+        nonlocal version, is_done, nodes, weights
+        if version == body.version and (is_done or time < first):
+            return
+        if following is not None and version != body.version:
+            nodes, weights = following.nodes.numpy(), following.weights.numpy()
+        version, is_done = body.version, time >= last
+        shares = [np.interp(time, times, shares) for times, shares in curves]
+        at_points, at_nodes = np.einsum("p,pvx->vx", shares, of_points), np.zeros((body.node_count, 3))
+        np.add.at(at_nodes, nodes.ravel(), (weights[:, :, None] * at_points[:, None]).reshape(-1, 3))
+        body.load("all", at_nodes)
+
+    update(0.0)
+    sim.on_step(lambda sim: update(sim.time), every=max(1, int(float(last - first) / UPDATES / sim.dt)))
     for options in sim.remesh:
         if options is not None:
-            sim.on_step(lambda sim: pressure.set(sim.time), every=options.every)
-
-
-class _Pressure:
-    """The pressures on a body over time.
-
-    Args:
-        body: The body.
-        loads: Pressures.
-        patches: The body's patches.
-        ramp: Time over which loads without times grow [s].
-
-    Attributes:
-        span: Time from the first to the last change of a pressure [s].
-    """
-
-    def __init__(self, body: SoftBody, loads: Sequence[Load], patches: BodyPatches, ramp: float):
-        surface = surface_of(patches)
-        forces = [load.values[0] * pressed(load, patches, surface) for load in loads]
-        self._curves = [load.curve(ramp) for load in loads]
-        self._first = min(times[0] for times, _ in self._curves)
-        self._last = max(times[-1] for times, _ in self._curves)
-        self.span = float(self._last - self._first)
-        self._body = body
-        there = np.any([each.any(axis=1) for each in forces], axis=0)
-        self._forces = np.stack([each[there] for each in forces])
-        follows = body.changing is not None
-        self._following = body.bind(surface.points[there]) if follows else None
-        self._nodes, self._weights = surface.nodes[there], surface.weights[there]
-        self._revision = -1
-        self._done = False
-
-    def set(self, time: float) -> None:
-        """Load the body's nodes for a time [s], if the loads have changed."""
-        if self._revision != self._body.version:
-            self._done = False
-        if self._done or (self._revision == self._body.version and time < self._first):
-            return
-        if self._following is not None and self._revision != self._body.version:
-            self._nodes, self._weights = self._following.nodes.numpy(), self._following.weights.numpy()
-        self._revision = self._body.version
-        shares = [np.interp(time, times, shares) for times, shares in self._curves]
-        at_points = np.einsum("p,pvx->vx", shares, self._forces)
-        self._body.load("all", nodal(at_points, self._nodes, self._weights, self._body.node_count))
-        self._done = time >= self._last
+            sim.on_step(lambda sim: update(sim.time), every=options.every)
 
 
 def surface_of(patches: BodyPatches) -> SurfaceMesh:
@@ -408,10 +383,3 @@ def pressed(load: Load, patches: BodyPatches, surface: SurfaceMesh) -> Array:
     forces = np.zeros_like(surface.points)
     np.add.at(forces, triangles.ravel(), np.repeat(-np.cross(b - a, c - a) / 6.0, 3, axis=0))
     return forces
-
-
-def nodal(forces: Array, nodes: npt.NDArray[np.integer], weights: npt.NDArray[np.floating], count: int) -> Array:
-    """Forces at bound points [N], [V, 3], distributed to the nodes [N], [count, 3]."""
-    found = np.zeros((count, 3))
-    np.add.at(found, nodes.ravel(), (weights[:, :, None] * forces[:, None]).reshape(-1, 3))
-    return found

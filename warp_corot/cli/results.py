@@ -6,6 +6,7 @@ import argparse
 import contextlib
 import csv
 import itertools
+import math
 import pickle
 import tempfile
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
@@ -23,7 +24,7 @@ from warp_corot.contact.tool import Obstacle, Tool
 from warp_corot.errors import InputError
 from warp_corot.inputs.loading import begin_loading
 from warp_corot.io.files.whole import check_output, writing
-from warp_corot.io.pictures.preview import FILMS, check_film, frames_shown, write_film
+from warp_corot.io.pictures.preview import FILMS, GIF_FPS, check_film, write_film
 from warp_corot.simulation.progress import bar_of
 
 from .options import VIEWS, is_static
@@ -80,19 +81,13 @@ class Probe:
         return [float(x) for x in (*(self._weights @ u), *(self._weights @ v), *(share @ r))]
 
     def _find(self) -> None:
-        """Find the nodes in the current mesh, and their weights."""
-        self._revision = self.body.version
-        if not self.is_patch:
-            self._place()
+        """Find the nodes in the current mesh, or the tetrahedron that contains the point or is nearest; and weights."""
+        self._revision, mesh = self.body.version, self.body.mesh
+        if self.is_patch:
+            self._nodes = np.flatnonzero(self._patches.of_mesh(mesh).some(self.text, "--probe"))
+            masses = self.body.masses[self._nodes]
+            self._weights = masses / masses.sum()
             return
-        mask = self._patches.of_mesh(self.body.mesh).some(self.text, "--probe")
-        weights = self.body.masses * mask
-        self._nodes = np.flatnonzero(mask)
-        self._weights = weights[self._nodes] / weights.sum()
-
-    def _place(self) -> None:
-        """Find the tetrahedron that contains the point, or the nearest one."""
-        mesh = self.body.mesh
         (element,), (weights,) = mesh.embed(self.point[None])
         inside = np.clip(weights, 0.0, None)
         self._weights, self._nodes = inside / inside.sum(), mesh.tets[element]
@@ -102,7 +97,10 @@ class Probe:
             raise InputError(f"--probe {self.text!r}: the point is {away:.3g} m outside the body")
 
 
-class Table:
+@contextlib.contextmanager
+def table_of(
+    path: Path, sim: Simulation, probes: Sequence[Probe], obstacles: Mapping[str, Obstacle]
+) -> Iterator[Callable[[], None]]:
     """A CSV file with one row for each frame; each row is written at once, by the first of several ranks.
 
     Args:
@@ -111,53 +109,36 @@ class Table:
         probes: Probes of its bodies.
         obstacles: Obstacles by name; the forces on them and the places of tools have columns.
 
-    Raises:
-        InputError: Another extension, a folder with this name, or no folder to write to.
+    Yields:
+        A function that adds a row with the current state, or raises a `WriteError` if it cannot be written.
     """
+    file: IO[str] | None = None
 
-    def __init__(
-        self,
-        path: Path,
-        sim: Simulation,
-        probes: Sequence[Probe],
-        obstacles: Mapping[str, Obstacle] | None = None,
-    ):
-        self.path, self._sim, self._probes = path, sim, probes
-        self._obstacles = dict(obstacles or {})
-        self._file: IO[str] | None = None
-
-    def add(self) -> None:
-        """Add a row with the current state.
-
-        Raises:
-            WriteError: It cannot be written.
-        """
-        energy = self._sim.energy()
-        values = [value for probe in self._probes for value in probe.values()]
-        values += [value for each in self._obstacles.values() for value in _felt(each).values()]
-        row = [self._sim.time, *values, energy.kinetic, energy.elastic, energy.gravitational, self._sim.dt]
-        if not self._sim.is_root:
-            return
-        with writing(self.path):
-            if self._file is None:
-                self._file = self.path.open("w", newline="")
-                csv.writer(self._file).writerow(self._header())
-            csv.writer(self._file).writerow([f"{value:.9g}" for value in row])
-            self._file.flush()
-
-    def close(self) -> None:
-        if self._file is not None:
-            self._file.close()
-
-    def _header(self) -> list[str]:
-        bodies = self._sim.bodies
-        names = ["time [s]"]
-        for probe in self._probes:
+    def add() -> None:
+        nonlocal file
+        bodies, energy = sim.bodies, sim.energy()
+        row = [("time [s]", sim.time)]
+        for probe in probes:
             of = f"body {bodies.index(probe.body) + 1}: " if len(bodies) > 1 else ""
-            names += [f"{of}{probe.text} {column}" for column in COLUMNS]
-        for name, each in self._obstacles.items():
-            names += [f"{name} {column}" for column in _felt(each)]
-        return [*names, "kinetic [J]", "elastic [J]", "gravitational [J]", "dt [s]"]
+            row += zip([f"{of}{probe.text} {column}" for column in COLUMNS], probe.values(), strict=True)
+        for name, each in obstacles.items():
+            row += [(f"{name} {column}", value) for column, value in _felt(each).items()]
+        row += [(f"{name} [J]", getattr(energy, name)) for name in ("kinetic", "elastic", "gravitational")]
+        row.append(("dt [s]", sim.dt))
+        if not sim.is_root:
+            return
+        with writing(path):
+            if file is None:
+                file = path.open("w", newline="")
+                csv.writer(file).writerow([name for name, _ in row])
+            csv.writer(file).writerow([f"{value:.9g}" for _, value in row])
+            file.flush()
+
+    try:
+        yield add
+    finally:
+        if file is not None:
+            file.close()
 
 
 def _felt(obstacle: Obstacle) -> dict[str, float]:
@@ -247,7 +228,9 @@ class Previews:
         self.views = _views(self.args.preview_views)
         self.frames, self.fps = _frames(self.args.preview_frames, self.count), self.args.fps
         if is_film(path):
-            self.frames, self.fps = frames_shown(path, list(range(self.count + 1)), self.args.fps)
+            # A GIF leaves out frames in between.
+            every = max(math.ceil(self.fps / GIF_FPS - 1e-9), 1) if path.suffix.lower() == ".gif" else 1
+            self.frames, self.fps = list(range(0, self.count + 1, every)), self.fps / every
         elif len(self.frames) * len(self.views) > MOST_PANELS:
             panels = f"{len(self.frames)} frames from {len(self.views)} sides"
             raise InputError(f"--preview would have {panels}; a picture has at most {MOST_PANELS} panels")
@@ -287,14 +270,15 @@ class Previews:
             return
         from warp_corot.io.pictures.preview import save_picture
 
-        shots = self._shots(name, bodies[0].soft.mesh.up_axis)
-        with bar_of(len(self._outermost), "frames", "drawing") as drawn, contextlib.closing(shots) as images:
-            if is_film(self.args.preview):
-                write_film(self.args.preview, _counted(images, drawn), self.fps)
-            else:
-                save_picture(next(images), self.args.preview)
+        with bar_of(len(self._outermost), "frames", "drawing") as drawn:
+            images = self._shots(name, bodies[0].soft.mesh.up_axis, drawn)
+            with contextlib.closing(images):
+                if is_film(self.args.preview):
+                    write_film(self.args.preview, images, self.fps)
+                else:
+                    save_picture(next(images), self.args.preview)
 
-    def _shots(self, name: str, up_axis: str) -> Generator[Image, None, None]:
+    def _shots(self, name: str, up_axis: str, drawn: Callable[[float], None]) -> Generator[Image, None, None]:
         """The frames of a film, or the only picture."""
         from warp_corot.io.pictures.preview import Strip
 
@@ -323,13 +307,8 @@ class Previews:
             yield strip.draw(
                 sheet, name if static or several else f"{name}; {f'{time:.2f}' if film else f'{time:.3g}'} s"
             )
+            drawn(number)
             sheet = []
-
-
-def _counted(images: Iterator[Image], drawn: Callable[[float], None]) -> Iterator[Image]:
-    for number, image in enumerate(images, start=1):
-        drawn(number)
-        yield image
 
 
 def is_film(path: Path) -> bool:

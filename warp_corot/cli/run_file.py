@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from warp_corot.errors import InputError
-from warp_corot.io.files.whole import check_output, written_whole
+from warp_corot.io.files.whole import written_whole
 
 from .options import LOADS, OF_THE_RUN, RUN, Option, options_of
 from .patches import Load, value_of
@@ -73,17 +73,6 @@ def write_run(path: Path, bodies: Sequence[argparse.Namespace]) -> None:
         part.write_bytes(data)
 
 
-def check_run_path(path: Path, source: str) -> None:
-    """Check, before a long run, that a run file can be written.
-
-    Raises:
-        InputError: It cannot.
-    """
-    check_output(path, (".toml",))
-    if path.exists() and Path(source).exists() and path.samefile(source):
-        raise InputError(f"{path}: is the input; it must be another file")
-
-
 def option_of(name: str) -> Callable[[str], Any]:
     """The function that reads the value of an option with one value.
 
@@ -117,9 +106,13 @@ def _body_of(table: dict[str, Any], asked: dict[str, Any], path: Path) -> argpar
         if name in LOADS and isinstance(value, list):
             body.curves += [_load(name, entry, path) for entry in value if isinstance(entry, dict)]
             value = [entry for entry in value if not isinstance(entry, dict)]
-        if _is_path(option):
-            several = option.is_list and isinstance(value, list)
-            value = [_beside(one, path, name) for one in value] if several else _beside(value, path, name)
+
+        def beside(given: Any, name: str = name) -> str:
+            if not isinstance(given, str):
+                raise InputError(f"{path}: {name} = {given!r} must be a name in quotation marks")
+            return str(path.parent / given)
+
+        value = _moved(option, value, beside)
         try:
             setattr(body, name, _value_of(option, value, path))
         except TypeError:
@@ -139,21 +132,16 @@ def _value_of(option: Option, value: Any, path: Path) -> Any:
         return value if option.is_flag else option.settings["const"] if value else option.default
     if option.is_flag:
         raise TypeError
-    if option.is_list:
-        return [_read(option, entry, path) for entry in (value if isinstance(value, list) else [value])] or None
-    return _read(option, value, path)
-
-
-def _read(option: Option, value: Any, path: Path) -> Any:
-    """A value, or the values of an option with several."""
-    count = option.settings.get("nargs")
-    words = value if isinstance(count, int) else [value]
-    if not isinstance(words, list) or any(isinstance(word, bool | list | dict) for word in words):
-        raise TypeError
-    if isinstance(count, int) and len(words) != count:
-        raise InputError(f"{path}: argument {option.flags[-1]}: expected {count} arguments")
-    read = [_one(option, str(word), path) for word in words]
-    return read if isinstance(count, int) else read[0]
+    count, found = option.settings.get("nargs"), []
+    for entry in value if option.is_list and isinstance(value, list) else [value]:
+        words = entry if isinstance(count, int) else [entry]
+        if not isinstance(words, list) or any(isinstance(word, bool | list | dict) for word in words):
+            raise TypeError
+        if isinstance(count, int) and len(words) != count:
+            raise InputError(f"{path}: argument {option.flags[-1]}: expected {count} arguments")
+        read = [_one(option, str(word), path) for word in words]
+        found.append(read if isinstance(count, int) else read[0])
+    return (found or None) if option.is_list else found[0]
 
 
 def _one(option: Option, text: str, where: object) -> Any:
@@ -174,16 +162,14 @@ def _one(option: Option, text: str, where: object) -> Any:
     return value
 
 
-def _is_path(option: Option) -> bool:
-    """Whether an option's value is a path, which is relative to the run file."""
-    return option.settings.get("type") is Path or option.name == "input"
-
-
-def _beside(value: Any, path: Path, name: str) -> Any:
-    if not isinstance(value, str):
-        raise InputError(f"{path}: {name} = {value!r} must be a name in quotation marks")
-    is_name = name == "input" and (value == "box" or value.startswith("warp:"))
-    return value if is_name else str(path.parent / value)
+def _moved(option: Option, value: Any, place: Callable[[Any], str]) -> Any:
+    """The value of an option with its paths, if it has any, at another place: in run files they are relative."""
+    if option.settings.get("type") is not Path and option.name != "input":
+        return value
+    given = value if option.is_list and isinstance(value, list) else [value]
+    is_name = option.name == "input" and isinstance(value, str) and (value == "box" or value.startswith("warp:"))
+    found = [each if is_name else place(each) for each in given]
+    return found if given is value else found[0]
 
 
 def _load(kind: str, table: dict[str, Any], path: Path) -> Load:
@@ -213,20 +199,11 @@ def _lines(body: argparse.Namespace, names: Iterable[str], folder: Path) -> list
         curves = [_table(load) for load in getattr(body, "curves", ()) if load.kind == name]
         if value == option.default and not curves:
             continue
-        if _is_path(option):
-            several = isinstance(value, list)
-            value = [_relative(str(one), folder, name) for one in (value if several else [value])]
-            value = value if several else value[0]
+        value = _moved(option, value, lambda one: str(one) if os.path.isabs(one) else os.path.relpath(one, folder))
         if name in LOADS:
             value = [*([patch, *map(_number, texts)] for patch, *texts in value or ()), *curves]
         lines.append(f"{option.flags[-1].lstrip('-')} = {_toml(value)}")
     return lines
-
-
-def _relative(value: str, folder: Path, name: str) -> str:
-    if os.path.isabs(value) or (name == "input" and (value == "box" or value.startswith("warp:"))):
-        return value
-    return os.path.relpath(value, folder)
 
 
 def _number(text: str) -> float | str:

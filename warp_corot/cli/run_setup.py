@@ -24,7 +24,7 @@ from warp_corot.simulation.static import solve_static
 from warp_corot.solvers import INTEGRATORS, BackwardEuler, Integrator, QuasiStatic, SymplecticEuler
 
 from .bodies import RunBody, asked_bodies, find_body, find_patches, gravity_of, make_body
-from .contact import RunContact, make_blade, place_ground, say_reach, touched_by
+from .contact import RunContact, moved, place_ground, say_reach, touched_by
 from .options import IMPLICIT_DT, integrator_name, is_static
 from .patches import press_patches, ramp_of
 from .results import Probe
@@ -155,7 +155,16 @@ def make_simulation(args: argparse.Namespace, bodies: Sequence[RunBody], touched
     """The simulation, its kernels compiled; a given step is shortened until a whole number of them makes a frame."""
     from warp_corot.io.write.animate import shortening, steps_per_frame
 
-    check_static(args, touches=touched.contact is not None, remeshes=any(body.remesh for body in bodies))
+    if is_static(args):
+        for name in ("integrator", "dt", "damping", "viscosity"):
+            if getattr(args, name) is not None:
+                raise InputError(f"--static has no steps in time; leave out --{name}")
+        if args.drop is not None:
+            raise InputError("--static has no fall; leave out --drop (--ground lets the bodies stand on the ground)")
+        if touched.contact is not None and are_several():
+            raise InputError("--static with contact runs in one process, and there are several ranks")
+        if any(body.remesh for body in bodies):
+            raise InputError("--static does not support remeshing; leave out --remesh")
     first = bodies[0].subject
     damping = first.damping if args.damping is None else args.damping
     viscosity = args.viscosity or 0.0
@@ -164,7 +173,14 @@ def make_simulation(args: argparse.Namespace, bodies: Sequence[RunBody], touched
         first.notes.append(note)
     integrator: Integrator
     if is_static(args):
-        integrator = static_integrator(args, bodies, touched)
+        # There are no steps in time; for bodies that only contact holds there are none from frame to frame, too.
+        held = touched.contact is None or all(body.soft.conditions.held_mask().any() for body in bodies)
+        if not held and moves(bodies, touched):
+            raise InputError(
+                "--static: tools and loads that move can only follow bodies that are held; add --fix, or leave out "
+                "--static"
+            )
+        integrator = QuasiStatic(1.0 / args.fps) if held else BackwardEuler(1.0 / args.fps)
     elif INTEGRATORS[integrator_name(args)].is_implicit:
         steps = steps_per_frame(args.fps, args.dt or IMPLICIT_DT)
         integrator = INTEGRATORS[integrator_name(args)](1.0 / (args.fps * steps), damping, viscosity)  # type: ignore[call-arg]
@@ -172,7 +188,15 @@ def make_simulation(args: argparse.Namespace, bodies: Sequence[RunBody], touched
         tried = min(_tried_step(body, damping, viscosity) for body in bodies)
         steps = steps_per_frame(args.fps, args.dt or tried)  # refuses an excessive number
         integrator = SymplecticEuler(None if args.dt is None else 1.0 / (args.fps * steps), damping, viscosity)
-    cuts = blades_of(args, bodies)
+    if not args.blade and args.blade_length is not None:
+        raise InputError("--blade-length is for --blade, which is not given")
+    for body in bodies if args.blade else ():
+        kept = "--skin input" if body.args.skin == "input" else "--draw-labels" if body.args.draw_labels else None
+        if kept:
+            raise InputError(f"{kept} draws a surface that does not come apart; with --blade leave it out")
+    size = max(float(np.ptp(body.subject.mesh.points, axis=0).max()) for body in bodies)
+    half = 0.5 * (args.blade_length or LONG * size)
+    cuts = [moved(Blade([(0.0, 0.0, -half), (0.0, 0.0, half)]), path) for path in args.blade or ()]
     kind = Simulation
     if are_several():
         from warp_corot.distributed import Simulation as kind
@@ -186,22 +210,6 @@ def make_simulation(args: argparse.Namespace, bodies: Sequence[RunBody], touched
         contact=touched.contact,
         cuts=cuts or None,
     )
-
-
-def blades_of(args: argparse.Namespace, bodies: Sequence[RunBody]) -> list[Blade]:
-    """The blades of ``--blade``.
-
-    Raises:
-        InputError: A file is no path, or there is a length and no blade.
-    """
-    if not args.blade and args.blade_length is not None:
-        raise InputError("--blade-length is for --blade, which is not given")
-    for body in bodies if args.blade else ():
-        kept = "--skin input" if body.args.skin == "input" else "--draw-labels" if body.args.draw_labels else None
-        if kept:
-            raise InputError(f"{kept} draws a surface that does not come apart; with --blade leave it out")
-    size = max(float(np.ptp(body.subject.mesh.points, axis=0).max()) for body in bodies)
-    return [make_blade(path, args.blade_length or LONG * size) for path in args.blade or ()]
 
 
 def _tried_step(one: RunBody, damping: float, viscosity: float) -> float:
@@ -237,22 +245,10 @@ SHORT_STEP = 2e-3
 FASTER = 2.0
 
 
-@dataclass(frozen=True)
-class Cost:
-    """What a step takes [s]: at least, for each element, and the factor of both with contact."""
-
-    least: float
-    element: float
-    touching: float
-
-    def of(self, elements: int, touches: bool) -> float:
-        return (self.least + self.element * elements) * (self.touching if touches else 1.0)
-
-
-#: Explicit and implicit steps of organs on a CPU core, and on an H200. They are rough: the choice must not depend on
-#: how busy a machine is.
-ON_CPU = Cost(3e-5, 25e-9, 2.4), Cost(1e-3, 0.7e-6, 6.0)
-ON_CUDA = Cost(12e-6, 25e-12, 40.0), Cost(1.5e-3, 50e-9, 3.0)
+#: What explicit and implicit steps of organs take [s], on a CPU core and on an H200: at least, for each element, and
+#: the factor of both with contact. They are rough: the choice must not depend on how busy a machine is.
+ON_CPU = (3e-5, 25e-9, 2.4), (1e-3, 0.7e-6, 6.0)
+ON_CUDA = (12e-6, 25e-12, 40.0), (1.5e-3, 50e-9, 3.0)
 
 
 def choose_steps(args: argparse.Namespace, bodies: Sequence[RunBody], touched: RunContact, device: wp.Device) -> None:
@@ -267,8 +263,18 @@ def choose_steps(args: argparse.Namespace, bodies: Sequence[RunBody], touched: R
     sure = 1.0 if all(isinstance(body.soft.mesh, TetForest) for body in bodies) else UNSURE
     if args.dt is not None and args.dt > FASTER * sure * step:
         why = f"unstable in steps of {1e3 * args.dt:.3g} ms"
-    elif args.dt is None and may_choose(bodies) and (times := _times_as_slow(bodies[0], step, touched, device)):
-        why = f"about {float(f'{times:.1g}'):.0f} times as slow"
+    elif args.dt is None and may_choose(bodies):
+        model, mesh = bodies[0].model, bodies[0].soft.mesh
+        compared = isinstance(model, Corotated) and model.level is None and isinstance(mesh, TetForest)
+        if not compared or step < SHORTEST:
+            return
+        costs = ON_CUDA if device.is_cuda else ON_CPU
+        of_contact = [touching if touched.contact is not None else 1.0 for *_, touching in costs]
+        takes = [(least + one * len(mesh.tets)) * more for (least, one, _), more in zip(costs, of_contact, strict=True)]
+        slow, fast = SHORTER * step / takes[0], IMPLICIT_DT / takes[1]
+        if slow >= 1.0 or fast < FASTER * slow:
+            return
+        why = f"about {float(f'{fast / slow:.1g}'):.0f} times as slow"
     else:
         return
     args.integrator = "backward-euler"
@@ -276,18 +282,6 @@ def choose_steps(args: argparse.Namespace, bodies: Sequence[RunBody], touched: R
         f"implicit steps, which damp vibrations, since explicit ones would be {why} "
         "(--integrator symplectic-euler makes those)"
     )
-
-
-def _times_as_slow(body: RunBody, step: float, touched: RunContact, device: wp.Device) -> float:
-    """How many times as slow as implicit steps explicit ones would be, if they are too slow; otherwise zero."""
-    model, mesh = body.model, body.soft.mesh
-    compared = isinstance(model, Corotated) and model.level is None and isinstance(mesh, TetForest)
-    if not compared or step < SHORTEST:
-        return 0.0
-    explicit, implicit = ON_CUDA if device.is_cuda else ON_CPU
-    size = len(mesh.tets), touched.contact is not None
-    slow, fast = SHORTER * step / explicit.of(*size), IMPLICIT_DT / implicit.of(*size)
-    return fast / slow if slow < 1.0 and fast >= FASTER * slow else 0.0
 
 
 def may_choose(bodies: Sequence[RunBody]) -> bool:
@@ -313,33 +307,6 @@ def _stable_step(body: RunBody) -> float:
     return float((heights * np.sqrt(np.asarray(body.soft.material.density, dtype=float) / stiffness)).min())
 
 
-# --- ``--static`` ----------------------------------------------------------------------------------------------------
-
-
-def check_static(args: argparse.Namespace, *, touches: bool, remeshes: bool) -> None:
-    """Check the options for static answers.
-
-    Args:
-        args: The options.
-        touches, remeshes: Whether other options ask for contact, or for remeshing.
-
-    Raises:
-        InputError: Options that exclude each other.
-    """
-    if not is_static(args):
-        # The simulation reports what an integrator cannot do.
-        return
-    for name in ("integrator", "dt", "damping", "viscosity"):
-        if getattr(args, name) is not None:
-            raise InputError(f"--static has no steps in time; leave out --{name}")
-    if touches and args.drop is not None:
-        raise InputError("--static has no fall; leave out --drop (--ground lets the bodies stand on the ground)")
-    if touches and are_several():
-        raise InputError("--static with contact runs in one process, and there are several ranks")
-    if remeshes:
-        raise InputError("--static does not support remeshing; leave out --remesh")
-
-
 def rest(args: argparse.Namespace, sim: Simulation) -> list[str]:
     """With --static, find where bodies are at rest before anything moves them; returns a line for each.
 
@@ -349,7 +316,11 @@ def rest(args: argparse.Namespace, sim: Simulation) -> list[str]:
     if not is_static(args):
         return []
     if sim.contact is not None:
-        return [_rest_in_contact(sim)]
+        began, found = WATCH.clock(), bring_to_rest(sim)
+        if not found.converged.all():
+            raise UnstableError(f"--static: {found.message}")
+        took = f"{found.iterations} long steps, {found.linear_iterations} linear iterations"
+        return [f"at rest in contact after {took}, {WATCH.clock() - began:.2f} s"]
     lines = []
     for body, model in zip(sim.bodies, sim.models, strict=True):
         report = solve_static(body, model=model, gravity=sim.gravity)
@@ -360,34 +331,6 @@ def rest(args: argparse.Namespace, sim: Simulation) -> list[str]:
             f"{report.time:.2f} s"
         )
     return lines
-
-
-def _rest_in_contact(sim: Simulation) -> str:
-    """Bring all bodies to rest on what they touch; returns a line."""
-    began = WATCH.clock()
-    found = bring_to_rest(sim)
-    if not found.converged.all():
-        raise UnstableError(f"--static: {found.message}")
-    return (
-        f"at rest in contact after {found.iterations} long steps, {found.linear_iterations} linear iterations, "
-        f"{WATCH.clock() - began:.2f} s"
-    )
-
-
-def static_integrator(args: argparse.Namespace, bodies: Sequence[RunBody], touched: RunContact) -> Integrator:
-    """The steps from one frame of a static answer to the next; there are none for bodies that only contact holds.
-
-    Raises:
-        InputError: They do not stay at rest, as something moves.
-    """
-    held = all(body.soft.conditions.held_mask().any() for body in bodies)
-    if touched.contact is None or held:
-        return QuasiStatic(1.0 / args.fps)
-    if moves(bodies, touched):
-        raise InputError(
-            "--static: tools and loads that move can only follow bodies that are held; add --fix, or leave out --static"
-        )
-    return BackwardEuler(1.0 / args.fps)  # makes no step
 
 
 def moves(bodies: Sequence[RunBody], touched: RunContact) -> bool:

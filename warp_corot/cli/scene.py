@@ -34,14 +34,21 @@ def run(args: argparse.Namespace) -> int:
     from warp_corot.newton.stages.stage import StageOptions
     from warp_corot.newton.stages.steps import StageSimulation
 
-    gravity = None if args.gravity is None else tuple(args.gravity)
+    gravity, ground = None if args.gravity is None else tuple(args.gravity), args.ground
+    if ground not in ("auto", "none"):
+        try:
+            ground = float(ground)
+        except ValueError:
+            ground = math.nan
+        if not math.isfinite(ground):
+            raise InputError(f"--ground {args.ground!r}: it must be a height in m, auto or none")
     options = StageOptions(
         args.young,
         args.poisson,
         args.density,
         gravity,
         args.viscosity,
-        _ground(args.ground),
+        ground,
         args.fix,
         args.radius,
         not args.no_soft_contact,
@@ -81,18 +88,6 @@ def run(args: argparse.Namespace) -> int:
         return early_end(error, done)
     print(_summary(args.input, sim, writer, done))
     return 0
-
-
-def _ground(text: str) -> float | str:
-    if text in ("auto", "none"):
-        return text
-    try:
-        height = float(text)
-    except ValueError:
-        height = math.nan
-    if not math.isfinite(height):
-        raise InputError(f"--ground {text!r}: it must be a height in m, auto or none")
-    return height
 
 
 def _summary(source: Path, sim: StageSimulation, writer: SceneWriter, done: Recording) -> str:

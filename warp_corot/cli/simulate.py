@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import argparse
 import hashlib
-from collections.abc import Sequence
-from contextlib import closing, nullcontext
+from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,6 +20,7 @@ from warp_corot.errors import InputError, UnstableError
 from warp_corot.holding.choice import NAMED
 from warp_corot.inputs.processes import process_count
 from warp_corot.inputs.stopwatch import KERNELS, WATCH
+from warp_corot.io.files.whole import check_output
 from warp_corot.mesh import TetForest
 from warp_corot.simulation.energy import Solves
 from warp_corot.simulation.simulation import Simulation
@@ -26,17 +28,15 @@ from warp_corot.solvers import INTEGRATORS
 
 from . import terminal
 from .options import is_static
-from .results import Previews, Table, check_preview
-from .run_file import bodies_of, check_run_path, write_run
-from .run_setup import RunSetup, rest, set_up
+from .results import Previews, check_preview, table_of
+from .run_file import bodies_of, write_run
+from .run_setup import rest, set_up
 from .terminal import early_end
 
 if TYPE_CHECKING:
     from warp_corot.discretization.elements import Mesh
     from warp_corot.io.write.animate import Progress, Recording
-    from warp_corot.io.write.skins import OwnSurface
     from warp_corot.materials.isotropic import Isotropic
-    from warp_corot.mesh.surfaces.bound import SurfaceMesh
 
     from .bodies import RunBody
     from .input_mesh import InputMesh
@@ -48,125 +48,105 @@ def run(args: argparse.Namespace) -> int:
     Raises:
         InputError: Bad options; nothing was simulated or written.
     """
-    from warp_corot.io.write.animate import Recording
-
-    options = bodies_of(args)
-    shared = options[0]
-    _check_output(args, shared)
-    ready = set_up(options)
-    done = Recording(shared.output)
-    table = Table(shared.csv, ready.sim, ready.probes, ready.touched.obstacles) if shared.csv else None
-    previews = Previews(shared, ready.count) if shared.preview and ready.sim.is_root else None
+    asked = Simulated(args)
     try:
-        if args.write_run is not None and ready.sim.is_root:
-            write_run(args.write_run, options)
-        with WATCH.part("solving"):
-            rested = rest(shared, ready.sim)
-        _record(args, shared, ready, done, table, previews)
-        if previews is not None:
-            with WATCH.part("drawing"):
-                previews.draw(ready.bodies, title_of(ready.bodies))
+        rested = asked.record()
     except (KeyboardInterrupt, UnstableError, OSError) as error:
-        return early_end(error, done)
-    print(summary(ready.bodies, ready.sim, done, ready.touched.rows, rested))
+        return early_end(error, asked.done)
+    print(summary(asked.ready.bodies, asked.ready.sim, asked.done, asked.ready.touched.rows, rested))
     return 0
 
 
-def simulated(args: argparse.Namespace) -> Recording:
-    """``run`` without a summary, for one run of many.
+class Simulated:
+    """A run that is ready, and what it writes.
+
+    Args:
+        args: The command's arguments.
+        alone: Whether it is not one of many runs that are compared: those have the same kind of steps, and no pictures.
+
+    Attributes:
+        ready: The run.
+        done: Its progress.
 
     Raises:
-        InputError, UnstableError, OSError: The errors that would end the command.
+        InputError: Bad options; nothing was simulated or written.
     """
-    from warp_corot.io.write.animate import Recording
 
-    options = bodies_of(args)
-    shared = options[0]
-    _check_output(args, shared)
-    # Runs that are compared have the same kind of steps.
-    ready = set_up(options, chooses=False)
-    done = Recording(shared.output)
-    table = Table(shared.csv, ready.sim, ready.probes, ready.touched.obstacles) if shared.csv else None
-    rest(shared, ready.sim)
-    _record(args, shared, ready, done, table, None)
-    return done
+    def __init__(self, args: argparse.Namespace, *, alone: bool = True):
+        from warp_corot.io.write.animate import Recording, frame_count
+        from warp_corot.io.write.paraview import check_also
+        from warp_corot.io.write.usd.pieces import PieceStore
 
+        self._args, self._options = args, bodies_of(args)
+        self._shared = shared = self._options[0]
+        if shared.output is None:
+            raise InputError("-o is missing; it must name the animation to write, for example -o out.usd")
+        if shared.duration is not None:
+            frame_count(shared.duration, shared.fps)
+        PieceStore(shared.output)  # checks the path, and writes nothing before the first frame
+        for other in shared.also or ():
+            check_also(other)
+        if shared.csv is not None:
+            check_output(shared.csv, (".csv",))
+        check_preview(shared)
+        if args.write_run is not None:
+            check_output(args.write_run, (".toml",))
+            if args.write_run.exists() and Path(args.input).exists() and args.write_run.samefile(args.input):
+                raise InputError(f"{args.write_run}: is the input; it must be another file")
+        self.ready = ready = set_up(self._options, chooses=alone)
+        self.done = Recording(shared.output)
+        self._previews = Previews(shared, ready.count) if alone and shared.preview and ready.sim.is_root else None
 
-def _check_output(args: argparse.Namespace, shared: argparse.Namespace) -> None:
-    """Check, before a long run, that its results can be written."""
-    from warp_corot.io.files.whole import check_output
-    from warp_corot.io.write.animate import frame_count
-    from warp_corot.io.write.paraview import check_also
-    from warp_corot.io.write.usd.pieces import PieceStore
+    def record(self) -> list[str]:
+        """Step the simulation, write its frames, and draw its pictures; returns lines on its states of rest.
 
-    if shared.output is None:
-        raise InputError("-o is missing; it must name the animation to write, for example -o out.usd")
-    if shared.duration is not None:
-        frame_count(shared.duration, shared.fps)
-    PieceStore(shared.output)  # checks the path, and writes nothing before the first frame
-    for other in shared.also or ():
-        check_also(other)
-    if shared.csv is not None:
-        check_output(shared.csv, (".csv",))
-    check_preview(shared)
-    if args.write_run is not None:
-        check_run_path(args.write_run, args.input)
+        Raises:
+            UnstableError, OSError: The errors that end the run.
+        """
+        from warp_corot.io.write.animate import progress_bar, record
 
-
-def _record(
-    args: argparse.Namespace,
-    shared: argparse.Namespace,
-    ready: RunSetup,
-    done: Recording,
-    table: Table | None,
-    previews: Previews | None,
-) -> None:
-    """Step the simulation and write its frames."""
-    from warp_corot.io.write.animate import progress_bar, record
-
-    bodies, sim = ready.bodies, ready.sim
-    with progress_bar(ready.count) as progress, nullcontext() if table is None else closing(table):
-        record(
-            sim,
-            shared.output,
-            duration=ready.duration or None,
-            fps=shared.fps,
-            surface=_surfaces(bodies, are_cut=sim.remeshing.are_cut),
-            tets=any(body.args.draw_tets for body in bodies) or None,
-            labels=any(body.args.draw_labels for body in bodies),
-            also=shared.also or (),
-            progress=_each_frame(progress, table, previews, bodies, sim),
-            recording=done,
-            about=about(args, bodies),
-        )
-
-
-def _surfaces(bodies: Sequence[RunBody], *, are_cut: bool) -> list[OwnSurface | SurfaceMesh | None] | None:
-    """The smooth surfaces of bodies; None if none has any, so that tetrahedra are drawn. Of those that are cut it is
-    that of the mesh."""
-    skins = [None if are_cut else body.subject.skin for body in bodies]
-    found = [
-        None if body.args.draw_labels else skin or body.subject.surface
-        for body, skin in zip(bodies, skins, strict=True)
-    ]
-    return found if any(surface is not None for surface in found) else None
-
-
-def _each_frame(
-    progress: Progress, table: Table | None, previews: Previews | None, bodies: Sequence[RunBody], sim: Simulation
-) -> Progress:
-    """The function that is called after each frame."""
-
-    def called(frame: int, count: int) -> None:
-        if table is not None:
-            with WATCH.part("writing"):
-                table.add()
-        if previews is not None:
+        args, shared, bodies, sim = self._args, self._shared, self.ready.bodies, self.ready.sim
+        if args.write_run is not None and sim.is_root:
+            write_run(args.write_run, self._options)
+        with WATCH.part("solving"):
+            rested = rest(shared, sim)
+        # The smooth surfaces of bodies; without any, tetrahedra are drawn, and of those that are cut the mesh's own.
+        skins = [None if sim.remeshing.are_cut else body.subject.skin for body in bodies]
+        surfaces = [
+            None if body.args.draw_labels else skin or body.subject.surface
+            for body, skin in zip(bodies, skins, strict=True)
+        ]
+        table: Any = nullcontext()
+        if shared.csv:
+            table = table_of(shared.csv, sim, self.ready.probes, self.ready.touched.obstacles)
+        with progress_bar(self.ready.count) as progress, table as add_row:
+            record(
+                sim,
+                shared.output,
+                duration=self.ready.duration or None,
+                fps=shared.fps,
+                surface=surfaces if any(surface is not None for surface in surfaces) else None,
+                tets=any(body.args.draw_tets for body in bodies) or None,
+                labels=any(body.args.draw_labels for body in bodies),
+                also=shared.also or (),
+                progress=partial(self._written, progress, add_row),
+                recording=self.done,
+                about=about(args, bodies),
+            )
+        if self._previews is not None:
             with WATCH.part("drawing"):
-                previews.add(frame, bodies, sim)
-        progress(frame, count)
+                self._previews.draw(bodies, title_of(bodies))
+        return rested
 
-    return called
+    def _written(self, progress: Progress, add_row: Callable[[], None] | None, frame: int, count: int) -> None:
+        """Add a frame to the table and the pictures."""
+        if add_row is not None:
+            with WATCH.part("writing"):
+                add_row()
+        if self._previews is not None:
+            with WATCH.part("drawing"):
+                self._previews.add(frame, self.ready.bodies, self.ready.sim)
+        progress(frame, count)
 
 
 # --- the description of a run in its stage ---------------------------------------------------------------------------
@@ -186,19 +166,16 @@ def about(args: argparse.Namespace, bodies: Sequence[RunBody]) -> dict[str, Any]
     said: dict[str, Any] = {"command": _text(getattr(args, "command_line", "warp-corot simulate"))}
     if args.input.lower().endswith(".toml"):
         said |= {"runFile": _text(args.input), "run": _text(Path(args.input).read_text(encoding="utf-8"))}
-    return said | {f"body{number}": _of_body(body) for number, body in enumerate(bodies, start=1)}
-
-
-def _of_body(body: RunBody) -> dict[str, Any]:
-    subject, args = body.subject, body.args
-    said = {"name": _text(subject.name), "input": _text(args.input), "held": body.held.words}
-    if subject.source is not None:
-        said["inputSha256"] = _hash(subject.source)
-    for name in ("scale", "unit"):
-        if getattr(args, name, None) is not None:
-            said[name] = getattr(args, name)
-    loads = "; ".join(map(str, body.loads))
-    return said | ({"loads": _text(loads)} if loads else {})
+    for number, body in enumerate(bodies, start=1):
+        subject, own = body.subject, body.args
+        said[f"body{number}"] = of_body = {"name": _text(subject.name), "input": _text(own.input)}
+        of_body["held"] = body.held.words
+        if subject.source is not None:
+            of_body["inputSha256"] = _hash(subject.source)
+        of_body |= {name: getattr(own, name) for name in ("scale", "unit") if getattr(own, name, None) is not None}
+        if loads := "; ".join(map(str, body.loads)):
+            of_body["loads"] = _text(loads)
+    return said
 
 
 def _hash(path: Path) -> str:
@@ -247,7 +224,23 @@ def summary(
     height = max(body.subject.height for body in bodies)
     at_end = f"{length(done.final_displacement)} at the end ({done.final_displacement / height:.1%} of the height)"
     shown = "" if static else f", {done.simulated:.4g} s"
-    lines, ranks = [], process_count()
+    lines, ranks, solves = [], process_count(), solved(sim, static)
+    # States of rest have no steps in time.
+    steps = [("solves", solves)] if solves else []
+    if not static:
+        shortest, longest = sim.dt_range
+        if sim.integrator.is_implicit:
+            name = next(name for name, kind in INTEGRATORS.items() if type(sim.integrator) is kind)
+            step = f"{milliseconds(sim.dt)}, {name}"
+        else:
+            step = milliseconds(longest)
+            if sim.integrator.dt is not None:
+                step = f"{milliseconds(shortest)}, as given"
+            elif shortest <= 0.99 * longest:
+                step = f"{milliseconds(shortest)} to {step}, following the state"
+            at_last = " (at the end)" if sim.remeshing.every else ""
+            step += f"; largest stable one at rest about {milliseconds(sim.stable_dt)}{at_last}"
+        steps = [("time step", step), *steps, ("speed", speed(done))]
     for body in bodies:
         lines += [f"{body.subject.name}, {body.held.words}", *aligned(_body_rows(body))]
     rows = [
@@ -255,7 +248,7 @@ def summary(
         *touched,
         ("gravity", f"{' '.join(f'{g:g}' for g in sim.gravity)} m/s^2{damping}"),
         *[("static", f"the first frame is {line}" if done.steps else line) for line in rested],
-        *_time_step(sim, done, static),
+        *steps,
         ("wall time", wall_time()),
         ("displacement", f"{length(done.largest_displacement)} largest, {at_end}"),
         ("device", f"{sim.device} ({sim.device.name})" + (f", {ranks} ranks" if ranks > 1 else "")),
@@ -299,7 +292,7 @@ def _body_rows(body: RunBody) -> list[tuple[str, str]]:
     if shares_dilatation(getattr(body.model, "dilatation", ELEMENT), body.soft.discretization):
         words.append("shared dilatation")
     rows = [
-        *_body(body.subject),
+        *_mesh_rows(body.subject),
         *_materials(body.subject, body.soft.mesh, body.soft.material),
         ("model", ", ".join(words)),
         ("fixed", f"{body.held.count} nodes, {body.held.words}" if body.held.count else "nothing"),
@@ -312,7 +305,7 @@ def aligned(rows: Sequence[tuple[str, str]]) -> list[str]:
     return [f"  {name:<14}{text}" for name, text in rows]
 
 
-def _body(subject: InputMesh) -> list[tuple[str, str]]:
+def _mesh_rows(subject: InputMesh) -> list[tuple[str, str]]:
     """For a body from a surface or a scan, the reports of its domain and its mesh, and their time."""
     if subject.domain is None:
         nodes, repaired = len(subject.mesh.points), getattr(subject.mesh, "repaired", 0)
@@ -322,13 +315,16 @@ def _body(subject: InputMesh) -> list[tuple[str, str]]:
         said = f" ({', '.join(remarks)})" if remarks else ""
         return [("mesh", f"{nodes} nodes, {len(subject.mesh.tets)} tetrahedra{said}")]
     assert isinstance(subject.mesh, TetForest)
+    assert subject.fidelity is not None
+    assert subject.surface is not None
     took = ", ".join(f"{stage} {seconds:.2f} s" for stage, seconds in subject.times.items())
-    rows = [*_block("domain", subject.domain.report()), *_block("mesh", subject.mesh.summary())]
-    if subject.fidelity is not None:
-        rows += _block("true to it", subject.fidelity.report())
-    if subject.surface is not None:
-        rows.append(("surface", f"{len(subject.surface.points)} points, {len(subject.surface.triangles)} triangles"))
-    return [*rows, ("ready in", f"{sum(subject.times.values()):.2f} s: {took}")]
+    return [
+        *_block("domain", subject.domain.report()),
+        *_block("mesh", subject.mesh.summary()),
+        *_block("true to it", subject.fidelity.report()),
+        ("surface", f"{len(subject.surface.points)} points, {len(subject.surface.triangles)} triangles"),
+        ("ready in", f"{sum(subject.times.values()):.2f} s: {took}"),
+    ]
 
 
 def _block(name: str, lines: list[str]) -> list[tuple[str, str]]:
@@ -366,35 +362,10 @@ def values_line(young: float, poisson: float, density: float) -> str:
     return f"E = {pressure(float(young))}, nu = {poisson:g}, rho = {density:g} kg/m^3"
 
 
-def _time_step(sim: Simulation, done: Recording, static: bool) -> list[tuple[str, str]]:
-    """The length of steps, their limit or the iterations that they needed, and the speed; states of rest have no
-    steps in time."""
-    found = solved(sim, static)
-    rows = [("solves", found)] if found else []
-    if static:
-        return rows
-    if sim.integrator.is_implicit:
-        name = next(name for name, kind in INTEGRATORS.items() if type(sim.integrator) is kind)
-        step = f"{milliseconds(sim.dt)}, {name}"
-    else:
-        at_last = " (at the end)" if sim.remeshing.every else ""
-        step = f"{_steps(sim)}; largest stable one at rest about {milliseconds(sim.stable_dt)}{at_last}"
-    return [("time step", step), *rows, ("speed", speed(done))]
-
-
 def speed(done: Recording) -> str:
     """The speed of stepping, in words."""
     stepping = max(done.stepping, 1e-9)
     return f"{done.steps / stepping:.0f} steps/s, {done.simulated / stepping:.3g} times real time"
-
-
-def _steps(sim: Simulation) -> str:
-    shortest, longest = sim.dt_range
-    if sim.integrator.dt is not None:
-        return f"{milliseconds(shortest)}, as given"
-    if shortest > 0.99 * longest:
-        return milliseconds(longest)
-    return f"{milliseconds(shortest)} to {milliseconds(longest)}, following the state"
 
 
 def milliseconds(seconds: float) -> str:

@@ -42,9 +42,8 @@ def run(args: argparse.Namespace) -> int:
     varied = dict(values_of(text) for text in args.vary)
     if len(varied) < len(args.vary):
         raise InputError("--vary names an option twice")
-    given = [word for name in ("duration", "device") if (word := getattr(args, name))]
-    names = [f"--{name}" for name in ("duration", "device") if getattr(args, name)]
-    others = [word for pair in zip(names, given, strict=True) for word in pair]
+    given = [(f"--{name}", getattr(args, name)) for name in ("duration", "device") if getattr(args, name)]
+    others = [word for pair in given for word in pair]
     others += [word for probe in args.probe or () for word in ("--probe", probe)]
     inputs: set[str] = set()
     for each in combinations(varied):
@@ -53,7 +52,17 @@ def run(args: argparse.Namespace) -> int:
         open_input(name)  # rather than in each run
     try:
         (args.output / RUNS).mkdir(parents=True, exist_ok=True)
-        _check_same(args.output, args.input, others)
+        # Finished runs in the folder must have had the same input and options.
+        is_file = args.input.lower().endswith(".toml")
+        text: object = Path(args.input).read_text(encoding="utf-8") if is_file else ""
+        told, path = {"input": args.input, "options": others, "run_file": text}, args.output / "sweep.json"
+        if not path.exists():
+            with written_whole(path) as part:
+                part.write_text(json.dumps(told), encoding="utf-8")
+        with contextlib.suppress(ValueError):
+            text = json.loads(path.read_text(encoding="utf-8"))
+        if text != told:
+            raise InputError(f"{args.output} has results of another input or of other options; name another folder")
         function = partial(simulated, _input=args.input, _others=others, _folder=str(args.output))
         rows = sweep(function, varied, folder=args.output, workers=args.workers, retries=args.retries)
     except KeyboardInterrupt as signalled:
@@ -67,27 +76,6 @@ def run(args: argparse.Namespace) -> int:
     if failed:
         complain(f"{len(failed)} runs failed, the first with {failed[0]['error']}")
     return 3 if failed else 0
-
-
-def _check_same(folder: Path, source: str, others: list[str]) -> None:
-    """Check that the finished runs in a folder had the same input and the same options.
-
-    Raises:
-        InputError: They had others.
-    """
-    text = Path(source).read_text(encoding="utf-8") if source.lower().endswith(".toml") else ""
-    told = {"input": source, "options": others, "run_file": text}
-    path = folder / "sweep.json"
-    if path.exists():
-        try:
-            same = json.loads(path.read_text(encoding="utf-8")) == told
-        except ValueError:
-            same = False
-        if not same:
-            raise InputError(f"{folder} has results of another input or of other options; name another folder")
-    else:
-        with written_whole(path) as part:
-            part.write_text(json.dumps(told), encoding="utf-8")
 
 
 def values_of(text: str) -> tuple[str, list[Any]]:
@@ -153,7 +141,7 @@ def simulated(*, _input: str, _others: list[str], _folder: str, **values: Any) -
 
     import warp as wp
 
-    from .simulate import simulated as made
+    from .simulate import Simulated
 
     wp.config.log_level = wp.LOG_ERROR
     wp.config.enable_backward = False
@@ -161,8 +149,9 @@ def simulated(*, _input: str, _others: list[str], _folder: str, **values: Any) -
     args = options_of(_input, _others, values, folder)
     log = (folder / RUNS / f"{name_of(values)}.log").open("w", encoding="utf-8")
     with log, contextlib.redirect_stdout(log), contextlib.redirect_stderr(log):
-        done = made(args)
+        made = Simulated(args, alone=False)
+        made.record()
     with open(folder / RUNS / f"{name_of(values)}.csv", newline="", encoding="utf-8") as file:
         heads, *rows = csv.reader(file)
     found: Row = {name: float(value) for name, value in zip(heads, rows[-1], strict=True)}
-    return found | {"largest displacement [m]": done.largest_displacement, "steps": done.steps}
+    return found | {"largest displacement [m]": made.done.largest_displacement, "steps": made.done.steps}

@@ -9,14 +9,13 @@ import re
 import signal
 import sys
 import threading
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext, suppress
 from types import FrameType
 from typing import TYPE_CHECKING, Any, TextIO
 
 from warp_corot.errors import InputError, UnstableError
-from warp_corot.inputs.processes import process_count, process_number
+from warp_corot.inputs.processes import process_count
 from warp_corot.inputs.stopwatch import KERNELS, WATCH
 
 if TYPE_CHECKING:
@@ -272,17 +271,6 @@ def are_several() -> bool:
     return process_count() > 1
 
 
-def speaks() -> bool:
-    """Whether this process prints: the only one, or the first of several."""
-    return process_number() == 0
-
-
-def fall_silent() -> None:
-    """Print nothing from here on: rank 0 prints for all ranks."""
-    null = open(os.devnull, "w")  # noqa: SIM115 (open as long as the process lives)
-    sys.stdout = sys.stderr = null
-
-
 def end_others(status: int) -> None:
     """On rank 0 of several, after a report: end this process with a status at once, and so all others. MPI's own end
     would wait for them, and they wait for this report."""
@@ -291,8 +279,3 @@ def end_others(status: int) -> None:
             with suppress(OSError, ValueError):
                 stream.flush()
         os._exit(status)
-
-
-def let_others_speak() -> None:
-    """Wait before a failed rank ends, because ``mpirun`` then ends all others: rank 0 first reports the error."""
-    time.sleep(REPORTED_WITHIN)

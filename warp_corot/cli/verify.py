@@ -67,7 +67,13 @@ def run(args: argparse.Namespace) -> int:
     beyond = sum(not row["passes"] for row in told)
     print(f"{len(told) - beyond} of {len(told)} rows pass on {device}, in {took:.0f} s")
     if args.json is not None:
-        finite = [{key: _plain(value) for key, value in row.items()} for row in told]
+        finite = [
+            {
+                key: value if isinstance(value, str | bool | None) else float(value) if math.isfinite(value) else None
+                for key, value in row.items()
+            }
+            for row in told
+        ]
         head = {"schema": "warp-corot/verify", "schema_version": 1, "full": args.full, "seconds": round(took, 1)}
         write_json(args.json, {**head, **environment(device), "rows": finite})
     if beyond:
@@ -82,13 +88,6 @@ def line(name: str, row: Row) -> str:
     return (
         f"{name:18}{row.quantity:38}{row.result:11.5g}{row.reference:11.5g} {row.unit:6}{error:>9}{bound:>9}  {verdict}"
     )
-
-
-def _plain(value: Any) -> Any:
-    """The value without NumPy's types; None for a number that JSON does not have."""
-    if value is None or isinstance(value, str | bool):
-        return value
-    return float(value) if math.isfinite(value) else None
 
 
 def environment(device: wp.Device) -> dict:

@@ -26,6 +26,18 @@ SPEED = 1.0
 FITTING = 0.25
 
 
+def checked_keys(times: npt.ArrayLike, positions: npt.ArrayLike, quaternions: npt.ArrayLike) -> Keys:
+    """Keyframes of poses; the arguments and errors are those of ``Tool.follow``."""
+    t = checked_times(times)
+    p = checked_numbers(positions, "positions", f"[{len(t)}, 3]")
+    if p.shape != (len(t), 3) or not np.isfinite(p).all():
+        raise InputError(f"positions has shape {p.shape}; it must be finite, [{len(t)}, 3]")
+    q = checked_numbers(quaternions, "quaternions", f"[{len(t)}, 4]")
+    if q.shape not in ((4,), (len(t), 4)) or not np.isfinite(q).all():
+        raise InputError(f"quaternions has shape {q.shape}; it must be finite, [{len(t)}, 4] or [4]")
+    return t, np.hstack([p, [checked_quaternion(row) for row in np.broadcast_to(q, (len(t), 4))]])
+
+
 class Tool:
     """A rigid obstacle that moves along keyframes, to a target, or to poses in an array on the device.
 
@@ -68,16 +80,9 @@ class Tool:
         Raises:
             InputError: Wrong shapes, times that do not increase, or numbers that are not finite.
         """
-        t = checked_times(times)
-        p = checked_numbers(positions, "positions", f"[{len(t)}, 3]")
-        if p.shape != (len(t), 3) or not np.isfinite(p).all():
-            raise InputError(f"positions has shape {p.shape}; it must be finite, [{len(t)}, 3]")
-        q = checked_numbers(self.pose[3:] if quaternions is None else quaternions, "quaternions", f"[{len(t)}, 4]")
-        if q.shape not in ((4,), (len(t), 4)) or not np.isfinite(q).all():
-            raise InputError(f"quaternions has shape {q.shape}; it must be finite, [{len(t)}, 4] or [4]")
-        q = np.broadcast_to(q, (len(t), 4))
-        q = np.array([checked_quaternion(row) for row in q])
-        self._move_by((t, np.hstack([p, q])), None, False)
+        self._move_by(
+            checked_keys(times, positions, self.pose[3:] if quaternions is None else quaternions), None, False
+        )
 
     def move(self, position: Vector, quaternion: Vector | None = None) -> None:
         """Move to a place on a straight line, no faster than ``speed``; at once if no simulation has the tool yet.

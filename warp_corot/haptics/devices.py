@@ -7,14 +7,15 @@ import time
 from array import array
 from collections.abc import Callable, Sequence
 from itertools import pairwise
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import numpy.typing as npt
 
 from warp_corot.contact.shapes import NO_TURN, checked_quaternion, checked_vector
+from warp_corot.contact.tool import checked_keys
 from warp_corot.errors import InputError
-from warp_corot.inputs.checks import checked_numbers, checked_times, shown
+from warp_corot.inputs.checks import shown
 
 Floats = npt.NDArray[np.float64]
 Pose = tuple[Floats, Floats]
@@ -24,23 +25,19 @@ class DeviceError(RuntimeError):
     """The haptic device failed, and the loop has stopped; one line says how."""
 
 
-def checked_pose(position: object, quaternion: object) -> Pose:
+def checked_pose(position: Any, quaternion: Any) -> Pose:
     """A position [m], [3], and a unit quaternion (x, y, z, w), [4].
 
     Raises:
         DeviceError: The reading is something else.
     """
     try:
-        place, turn = np.array(position, dtype=np.float64), np.array(quaternion, dtype=np.float64)
-    except (TypeError, ValueError):
-        place, turn = np.zeros(0), np.zeros(0)
-    length = float(np.linalg.norm(turn)) if turn.shape == (4,) else math.nan
-    if place.shape != (3,) or not np.isfinite(place).all() or not 0.0 < length < math.inf:
+        return checked_vector(position, "position"), checked_quaternion(quaternion)
+    except (InputError, TypeError, ValueError):
         raise DeviceError(
             f"the haptic device read {shown(position)} and {shown(quaternion)}; it must read three finite numbers and "
             "a quaternion"
-        )
-    return place, turn / length
+        ) from None
 
 
 def way(before: Pose, now: Pose) -> tuple[Floats, Floats]:
@@ -96,18 +93,9 @@ class ScriptedDevice:
         *,
         clock: Callable[[], float] = time.perf_counter,
     ):
-        self._times = checked_times(times)
-        count = len(self._times)
-        places = checked_numbers(positions, "positions", f"[{count}, 3]")
-        turns = checked_numbers(np.tile(NO_TURN, (count, 1)) if quaternions is None else quaternions, "quaternions", "")
-        if places.shape != (count, 3) or not np.isfinite(places).all():
-            raise InputError(f"positions has shape {places.shape}; it must be finite, [{count}, 3]")
-        if turns.shape != (count, 4):
-            raise InputError(f"quaternions has shape {turns.shape}; it must be [{count}, 4]")
-        turns = np.array([checked_quaternion(turn) for turn in turns])
-        for before, after in pairwise(turns):
+        self._times, self._poses = checked_keys(times, positions, NO_TURN if quaternions is None else quaternions)
+        for before, after in pairwise(self._poses[:, 3:]):
             after *= 1.0 if before @ after >= 0.0 else -1.0
-        self._poses = np.hstack([places, turns])
         self._clock, self._start = clock, math.nan
         self._now, self._place = 0.0, self._poses[0]
         # Not a list of tuples: Python's collector would look through all of them, for longer and longer.

@@ -161,7 +161,8 @@ class LocalModel:
         size = float(np.linalg.norm(state.force))
         self._position, self._force, self._torque = state.position, state.force, state.torque
         if size < NO_FORCE:
-            self._leave()
+            self.normal, self.stiffness = np.zeros(3), self._expected
+            self._depth = self._push = self._square = self._product = 0.0
             return
         normal = state.force / size
         touched = self.normal.any()
@@ -172,22 +173,9 @@ class LocalModel:
         else:
             self._origin = state.position.copy()
         self.normal = normal
-        self._measure(float((self._origin - state.position) @ normal), float(state.force @ normal), first=not touched)
-
-    def forces(self, position: Floats) -> tuple[Floats, Floats]:
-        """Force [N] and torque [N m] on the tool in the hand at a position [m]; the tissue never pulls."""
-        if not self.normal.any():
-            return np.zeros(3), np.zeros(3)
-        deeper = float((self._position - position) @ self.normal)
-        push = float(self._force @ self.normal)
-        continued = push + self.stiffness * deeper
-        if continued <= 0.0 or push <= 0.0:
-            return np.zeros(3), np.zeros(3)
-        return self._force + self.stiffness * deeper * self.normal, self._torque * min(continued / push, 1.0)
-
-    def _measure(self, depth: float, push: float, *, first: bool) -> None:
-        """Measure the slope of force over depth in the last states, if the depths vary enough."""
-        if first:
+        # The slope of force over depth in the last states, if the depths vary enough.
+        depth, push = float((self._origin - state.position) @ normal), float(state.force @ normal)
+        if not touched:
             self._depth, self._push = depth, push
             return
         new = 1.0 - MEMORY
@@ -199,9 +187,16 @@ class LocalModel:
         found = (self._product + SPREAD**2 * self._expected) / (self._square + SPREAD**2)
         self.stiffness = float(np.clip(found, 0.0, self._most))
 
-    def _leave(self) -> None:
-        self.normal, self.stiffness = np.zeros(3), self._expected
-        self._depth = self._push = self._square = self._product = 0.0
+    def forces(self, position: Floats) -> tuple[Floats, Floats]:
+        """Force [N] and torque [N m] on the tool in the hand at a position [m]; the tissue never pulls."""
+        if not self.normal.any():
+            return np.zeros(3), np.zeros(3)
+        deeper = float((self._position - position) @ self.normal)
+        push = float(self._force @ self.normal)
+        continued = push + self.stiffness * deeper
+        if continued <= 0.0 or push <= 0.0:
+            return np.zeros(3), np.zeros(3)
+        return self._force + self.stiffness * deeper * self.normal, self._torque * min(continued / push, 1.0)
 
 
 class PassivityControl:

@@ -9,7 +9,6 @@ import sys
 import threading
 import time
 from dataclasses import dataclass
-from types import TracebackType
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -24,7 +23,7 @@ from .devices import Device, DeviceError, Pose, checked_pose, way
 from .exchange import HapticExchange, LocalModel, PassivityControl, ToolState
 
 if TYPE_CHECKING:
-    from warp_corot.materials.isotropic import Isotropic
+    pass
 
 
 #: Number of readings that are kept: more than a quarter of an hour at 1 kHz.
@@ -168,7 +167,11 @@ class HapticLoop:
         self.period = 1.0 / _positive(rate, "rate", "1/s")
         self._most_force = _positive(most_force, "most_force", "N")
         bound, reach = _positive(energy_bound, "energy_bound", "J"), SPEED * self.period
-        expected = _stiffness(sim.bodies[0].material.isotropic, tool) if stiffness is None else stiffness
+        expected = stiffness
+        if expected is None:  # Johnson, Contact Mechanics, 3.4
+            material = sim.bodies[0].material.isotropic
+            young, poisson = float(np.median(material.young)), float(np.median(material.poisson))
+            expected = 2.0 * min(tool.shape.thickness, 0.01) * young / (1.0 - poisson**2)
         self._sim, self._tool, self._device = sim, tool, device
         self._model = LocalModel(_positive(expected, "stiffness", "N/m"), 2.0 * bound / reach**2)
         self._control = PassivityControl(bound, reach, TURN_RATE * self.period)
@@ -239,9 +242,7 @@ class HapticLoop:
         self.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.stop()
 
     def run(self, seconds: float, every: float = EVERY) -> float:
@@ -309,38 +310,41 @@ class HapticLoop:
         self._exchange.send(position, quaternion, now)
         newest = self._exchange.newest(self._state)
         if newest is not None and newest is not self._state:
-            self._take(newest, now)
+            self._state, self._updated = newest, now
+            self._updates += 1
+            if newest.stamp > 0.0:
+                self._delays.add(now - newest.stamp)
+            if np.isfinite(newest.force).all() and np.isfinite(newest.torque).all():
+                self._model.follow(newest)
         moved, turned = (np.zeros(3), np.zeros(3)) if self._pose is None else way(self._pose, (position, quaternion))
         elapsed = 0.0 if math.isnan(self._last) else now - self._last
         self._control.observe(moved, turned, elapsed)
-        force, torque = self._wanted(position, now)
-        self._device.write(*self._control.control(force, torque, moved, turned))
-        self._pose, self._last = (position, quaternion), now
-
-    def _take(self, newest: ToolState, now: float) -> None:
-        self._state, self._updated = newest, now
-        self._updates += 1
-        if newest.stamp > 0.0:
-            self._delays.add(now - newest.stamp)
-        if np.isfinite(newest.force).all() and np.isfinite(newest.torque).all():
-            self._model.follow(newest)
-
-    def _wanted(self, position: Floats, now: float) -> tuple[Floats, Floats]:
-        """The model's force and torque, no larger than the device bears, fading if the simulation is silent."""
+        # No larger than the device bears, fading if the simulation is silent.
         force, torque = self._model.forces(position)
-        size = float(np.linalg.norm(force))
-        share = 1.0 if size <= self._most_force else self._most_force / size
-        silent = 0.0 if self._state is None else now - self._updated - PATIENCE
-        if silent > 0.0:
-            share *= max(1.0 - silent / PATIENCE, 0.0)
-        return share * force, share * torque
+        share = min(self._most_force / max(float(np.linalg.norm(force)), 1e-300), 1.0)
+        silent = 0.0 if self._state is None else max(now - self._updated - PATIENCE, 0.0)
+        share *= max(1.0 - silent / PATIENCE, 0.0)
+        self._device.write(*self._control.control(share * force, share * torque, moved, turned))
+        self._pose, self._last = (position, quaternion), now
 
     def _run(self) -> None:
         """The thread."""
         interval = sys.getswitchinterval()
         sys.setswitchinterval(min(interval, SWITCH))
         try:
-            self._keep_time()
+            due = last = time.perf_counter()
+            while not self._is_to_stop.is_set():
+                started = time.perf_counter()
+                if self._busy.count:
+                    self._periods.add(started - last)
+                last = started
+                self.tick(started)
+                ended = time.perf_counter()
+                self._busy.add(ended - started)
+                late = int((ended - due) / self.period)
+                self._missed += late
+                due += (late + 1) * self.period
+                time.sleep(max(due - time.perf_counter(), 0.0))
         except Exception as error:
             words = " ".join(f"{type(error).__name__}: {error}".split())
             self.error = words if isinstance(error, DeviceError) else f"the haptic device failed: {words}"
@@ -351,28 +355,6 @@ class HapticLoop:
                 self._device.write(np.zeros(3), np.zeros(3))
             except Exception:
                 logging.getLogger(__name__).debug("the device takes no last force", exc_info=True)
-
-    def _keep_time(self) -> None:
-        due = last = time.perf_counter()
-        while not self._is_to_stop.is_set():
-            started = time.perf_counter()
-            if self._busy.count:
-                self._periods.add(started - last)
-            last = started
-            self.tick(started)
-            ended = time.perf_counter()
-            self._busy.add(ended - started)
-            late = int((ended - due) / self.period)
-            self._missed += late
-            due += (late + 1) * self.period
-            time.sleep(max(due - time.perf_counter(), 0.0))
-
-
-def _stiffness(material: Isotropic, tool: Tool) -> float:
-    """The stiffness of a half-space under a flat punch as thick as the tool [N/m] (Johnson, Contact Mechanics, 3.4)."""
-    young, poisson = float(np.median(material.young)), float(np.median(material.poisson))
-    radius = min(tool.shape.thickness, 0.01)
-    return 2.0 * radius * young / (1.0 - poisson**2)
 
 
 def _positive(given: float, name: str, unit: str) -> float:

@@ -11,7 +11,6 @@ from collections.abc import Iterable
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from functools import cache
 from importlib import import_module
-from types import ModuleType
 from typing import TypeAlias
 
 import warp as wp
@@ -55,7 +54,7 @@ def begin_loading(names: Iterable[str], device: wp.Device, kernels: Iterable[Loa
 
     A module with a ``BLOCK`` is loaded for so many threads of a block."""
     files = [import_module(f"warp_corot.kernels.{name}") for name in names]
-    modules = [(wp.get_module(file.__name__), block_of(file)) for file in files]
+    modules = [(wp.get_module(file.__name__), getattr(file, "BLOCK", None)) for file in files]
     pairs = [each if isinstance(each, tuple) else (each, None) for each in kernels]
     found = []
     for module, threads in (*((kernel.module, threads) for kernel, threads in pairs), *modules):
@@ -65,12 +64,6 @@ def begin_loading(names: Iterable[str], device: wp.Device, kernels: Iterable[Loa
             _begun[key] = _threads().submit(wp.load_module, module, device, block_dim=threads)
         found.append(_begun[key])
     return found
-
-
-def block_of(file: ModuleType) -> int | None:
-    """The number of threads of a block with which a file's kernels are launched on CUDA; None: Warp's default."""
-    block = getattr(file, "BLOCK", None)
-    return None if block is None else int(block)
 
 
 def progress() -> tuple[int, int, float | None] | None:

@@ -109,7 +109,12 @@ class _Evaluation:
 
     def mask(self, names: Names) -> npt.NDArray[np.bool_]:
         try:
-            tree = ast.parse(self._checked_text(), mode="eval").body
+            text = self.expression.strip()
+            if not text:
+                raise self._error('it is empty; it must be a condition like "z < 0.01"')
+            if len(text) > _LONGEST or not text.isprintable():
+                raise self._error(f"it must be at most {_LONGEST} printable characters")
+            tree = ast.parse(text, mode="eval").body
             used = {node.id for node in ast.walk(tree) if isinstance(node, ast.Name)}
             names = {**names, **{name: self.named[name]() for name in sorted(used & self.named.keys())}}
             names[_PLACES] = np.arange(self.count)
@@ -123,14 +128,6 @@ class _Evaluation:
             raise self._error('the result is a number; it must be true or false, like "z < 0.01"')
         return np.array(np.broadcast_to(value, self.count))
 
-    def _checked_text(self) -> str:
-        text = self.expression.strip()
-        if not text:
-            raise self._error('it is empty; it must be a condition like "z < 0.01"')
-        if len(text) > _LONGEST or not text.isprintable():
-            raise self._error(f"it must be at most {_LONGEST} printable characters")
-        return text
-
     def _hint(self) -> str:
         text = self.expression
         for pair in ("<=", ">=", "==", "!="):
@@ -140,7 +137,14 @@ class _Evaluation:
     def _value(self, node: ast.expr, names: Names, count: int) -> np.ndarray:
         match node:
             case ast.Constant(value=bool() | int() | float() as value):
-                return self._constant(node, value)
+                try:
+                    return (
+                        np.asarray(value)
+                        if isinstance(value, bool)
+                        else self._finite(node, np.asarray(float(value)), 1)
+                    )
+                except OverflowError:
+                    raise self._error("it has a number that is too large") from None
             case ast.Name(id=name):
                 if name not in names:
                     known = sorted({*names, *self.named} - {_PLACES})
@@ -161,24 +165,32 @@ class _Evaluation:
                 pairs = zip(ops, sides[:-1], sides[1:], strict=True)
                 return np.logical_and.reduce(np.broadcast_arrays(*(_COMPARISONS[type(op)](a, b) for op, a, b in pairs)))
             case ast.BoolOp(op=op, values=values):
-                return self._chain(isinstance(op, ast.And), values, names, count)
+                # Each part is evaluated only at nodes that the parts before do not decide.
+                is_and, result = (
+                    isinstance(op, ast.And),
+                    np.array(np.broadcast_to(self._truth(values[0], names, count), count)),
+                )
+                for part in values[1:]:
+                    open_nodes = np.flatnonzero(result == is_and)
+                    there = {name: v[open_nodes] if v.ndim else v for name, v in names.items()}
+                    result[open_nodes] = self._truth(part, there, len(open_nodes))
+                return result
             case ast.Call(func=ast.Name(id=name), args=args, keywords=[]) if name in FUNCTIONS:
                 function, least, most = FUNCTIONS[name]
                 if len(args) < least or (most is not None and len(args) > most):
                     raise self._error(f"{name} takes {least}{'' if most else ' or more'} arguments, not {len(args)}")
                 return self._finite(node, function(*(self._number(arg, names, count) for arg in args)), count)
             case ast.Call(func=ast.Name(id=name), args=args, keywords=[]) if name in REGIONS:
-                return self._region(name, [self._constant_number(arg, names) for arg in args])[names[_PLACES]]
+                given = [self._number(arg, names, self.count) for arg in args]
+                varies = next((arg for arg, value in zip(args, given, strict=True) if value.ndim), None)
+                if varies is not None:
+                    what = f"{ast.unparse(varies)!r} differs from node to node"
+                    raise self._error(f"{what}; numbers of a region must be constant")
+                return self._region(name, list(map(float, given)))[names[_PLACES]]
             case ast.Call(func=ast.Name(id=name)) if name not in FUNCTIONS:
                 known_functions = ", ".join([*FUNCTIONS, *REGIONS])
                 raise self._error(f"{name!r} is not a function here; functions are {known_functions}")
         raise self._error(f"{ast.unparse(node)!r} is not understood{self._hint()}")
-
-    def _constant_number(self, node: ast.expr, names: Names) -> float:
-        value = self._number(node, names, self.count)
-        if value.ndim:
-            raise self._error(f"{ast.unparse(node)!r} differs from node to node; numbers of a region must be constant")
-        return float(value)
 
     def _region(self, name: str, given: list[float]) -> npt.NDArray[np.bool_]:
         """All nodes of a region."""
@@ -198,23 +210,6 @@ class _Evaluation:
         chosen = np.zeros(self.count, bool)
         chosen[np.argsort(away, kind="stable")[: int(count)]] = True
         return chosen
-
-    def _constant(self, node: ast.expr, value: float) -> np.ndarray:
-        if isinstance(value, bool):
-            return np.asarray(value)
-        try:
-            return self._finite(node, np.asarray(float(value)), 1)
-        except OverflowError:
-            raise self._error("it has a number that is too large") from None
-
-    def _chain(self, is_and: bool, values: list[ast.expr], names: Names, count: int) -> np.ndarray:
-        """``and`` and ``or``: each part is evaluated only at nodes that the parts before do not decide."""
-        result = np.array(np.broadcast_to(self._truth(values[0], names, count), count))
-        for value in values[1:]:
-            open_nodes = np.flatnonzero(result == is_and)
-            there = {name: v[open_nodes] if v.ndim else v for name, v in names.items()}
-            result[open_nodes] = self._truth(value, there, len(open_nodes))
-        return result
 
     def _truth(self, node: ast.expr, names: Names, count: int) -> np.ndarray:
         value = self._value(node, names, count)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import tempfile
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import asdict, replace
 from functools import partial
 from importlib.util import find_spec
@@ -15,7 +15,7 @@ import numpy as np
 
 from warp_corot.contact.shapes import Ground
 from warp_corot.contact.tool import Tool
-from warp_corot.elasticity import MODELS, Corotated, EdgeStVK, MassSpring, Model, Prestressed, Prony
+from warp_corot.elasticity import MODELS, Corotated, EdgeStVK, MassSpring, Prestressed, Prony
 from warp_corot.elasticity.dilatation import AUTO
 from warp_corot.errors import InputError, UnstableError
 from warp_corot.inputs.checks import checked_choice, checked_count, checked_flag, checked_number, checked_vector, shown
@@ -57,22 +57,26 @@ class Saving:
         run_file: The run file of the simulation, or None.
 
     Attributes:
-        kinds: What can be saved.
+        kinds: What can be saved: the name of its file, and what writes it and may return a note.
     """
 
     def __init__(
         self, session: Session, show: Callable[[], None], run_file: Callable[[Simulation], bytes] | None = None
     ):
         self._session, self._show, self._is_cancelled = session, show, False
-        self.kinds: dict[str, Callable[[Visitor, float], str | None]] = {
-            "picture": self._picture,
-            "film": self._film,
-            "animation": self._animation,
-            "checkpoint": self._checkpoint,
+        self.kinds: dict[str, tuple[str, Callable[[Visitor, float, Path], str | None]]] = {
+            "picture": ("picture.png", lambda who, _, path: _drawn(who).save(path)),
+            "film": ("film.mp4" if find_spec("imageio_ffmpeg") else "film.gif", self._film),
+            "animation": ("animation.usd", self._animation),
+            "checkpoint": ("checkpoint.npz", lambda _who, _, path: session.sim.save(path)),
         }
         if run_file is not None:
             text = run_file
-            self.kinds["run file"] = lambda who, _: _send(who, "run.toml", text(session.sim))
+
+            def write(_who: Visitor, _seconds: float, path: Path) -> None:
+                path.write_bytes(text(session.sim))
+
+            self.kinds["run file"] = ("run.toml", write)
 
     def save(self, visitor: Visitor, kind: str, seconds: float) -> None:
         """Save something for a visitor.
@@ -89,7 +93,13 @@ class Saving:
             raise InputError("something is being saved; it must end first")
         session.busy, self._is_cancelled = True, False
         try:
-            session.note = self.kinds[kind](visitor, seconds) or ""
+            with tempfile.TemporaryDirectory() as folder:
+                name, write = self.kinds[kind]
+                path = Path(folder, name)
+                session.note = write(visitor, seconds, path) or ""
+                if path.exists():
+                    content = path.read_bytes()
+                    visitor.send(packed({"kind": "file", "name": name, "size": len(content)}, content))
         except (OSError, RuntimeError) as error:  # a browser that has gone, a full disk
             session.note = f"nothing was saved: {error}"
         finally:
@@ -100,63 +110,35 @@ class Saving:
         """End a film or an animation after the present frame; what there is of it is kept."""
         self._is_cancelled = True
 
-    # --- pictures --------------------------------------------------------------------------------------------------
-
-    def _picture(self, visitor: Visitor, _: float) -> None:
-        found = io.BytesIO()
-        _drawn(visitor).save(found, format="PNG")
-        _send(visitor, "picture.png", found.getvalue())
-
-    def _film(self, visitor: Visitor, seconds: float) -> None:
+    def _film(self, visitor: Visitor, seconds: float, path: Path) -> None:
         """Save frames at even intervals of simulated time, however long each one takes."""
-        name = "film.mp4" if find_spec("imageio_ffmpeg") else "film.gif"
-        count = frame_count(seconds, FPS)
-        with tempfile.TemporaryDirectory() as folder:
-            frames = []
-            for number in range(count + 1):
-                if self._is_cancelled:
-                    break
-                if number:
-                    self._session.sim.advance(1.0 / FPS)
-                self._between(number, count)
-                frames.append(Path(folder) / f"{number}.png")
-                _drawn(visitor).save(frames[-1])
-            if frames:
-                write_film(Path(folder) / name, _opened(frames), FPS)
-                _send(visitor, name, (Path(folder) / name).read_bytes())
+        count, frames = frame_count(seconds, FPS), list[Path]()
+        for number in range(count + 1):
+            if self._is_cancelled:
+                break
+            if number:
+                self._session.sim.advance(1.0 / FPS)
+            self._between(number, count)
+            frames.append(path.with_name(f"{number}.png"))
+            _drawn(visitor).save(frames[-1])
+        if frames:
+            write_film(path, map(_opened, frames), FPS)
 
-    # --- files -----------------------------------------------------------------------------------------------------
-
-    def _animation(self, visitor: Visitor, seconds: float) -> str:
-        session, note = self._session, ""
+    def _animation(self, visitor: Visitor, seconds: float, path: Path) -> str:
+        session = self._session
 
         def progress(number: int, count: int) -> None:
             self._between(number, count)
             if self._is_cancelled:
                 raise Cancelled
 
-        with tempfile.TemporaryDirectory() as folder:
-            path = Path(folder) / "animation.usd"
-            try:
-                record(
-                    session.sim,
-                    path,
-                    duration=seconds,
-                    fps=FPS,
-                    world=session.controls.world,
-                    surface=[surfaces.get(INPUT) for surfaces in session.surfaces],
-                    progress=progress,
-                )
-            except (Cancelled, UnstableError) as error:  # the frames before are there
-                note = str(error)
-            _send(visitor, path.name, path.read_bytes())
-        return note
-
-    def _checkpoint(self, visitor: Visitor, _: float) -> None:
-        with tempfile.TemporaryDirectory() as folder:
-            path = Path(folder) / "checkpoint.npz"
-            self._session.sim.save(path)
-            _send(visitor, path.name, path.read_bytes())
+        try:
+            surfaces = [surfaces.get(INPUT) for surfaces in session.surfaces]
+            world = session.controls.world
+            record(session.sim, path, duration=seconds, fps=FPS, world=world, surface=surfaces, progress=progress)
+        except (Cancelled, UnstableError) as error:  # the frames before are there
+            return str(error)
+        return ""
 
     def _between(self, number: int, count: int) -> None:
         """Continue during a long save: hands move, and the frame is shown."""
@@ -171,22 +153,14 @@ def _drawn(visitor: Visitor) -> Image:
     Raises:
         OSError, RuntimeError: The browser has left, or does not draw.
     """
+    return _opened(io.BytesIO(visitor.drawn(WIDTH, HEIGHT, PATIENCE)))
+
+
+def _opened(file: Path | io.BytesIO) -> Image:
     from PIL import Image
 
-    with Image.open(io.BytesIO(visitor.drawn(WIDTH, HEIGHT, PATIENCE))) as drawn:
-        return drawn.convert("RGB")
-
-
-def _opened(frames: list[Path]) -> Iterator[Image]:
-    from PIL import Image
-
-    for path in frames:
-        with Image.open(path) as image:
-            yield image.convert("RGB")
-
-
-def _send(visitor: Visitor, name: str, content: bytes) -> None:
-    visitor.send(packed({"kind": "file", "name": name, "size": len(content)}, content))
+    with Image.open(file) as image:
+        return image.convert("RGB")
 
 
 # --- tissues: laws, moduli, and tissues of the literature ------------------------------------------------------------
@@ -266,60 +240,29 @@ def switched(sim: Simulation, wanted: dict[str, Any], gravity: Sequence[float]) 
     now, found = present(sim), dict[str, Any]()
     changes = {name for name, value in now.items() if wanted.get(name, value) != value}
     if changes & {"law", "rotations"}:
-        model = model_of(wanted["law"], wanted["rotations"], sim.models[0])
+        # Only the corotated law shares rotations, and springs share no dilatation; the choice of that stays.
+        former, kind, options = sim.models[0], MODELS[wanted["law"]], dict[str, Any]()
+        springs = (EdgeStVK, MassSpring)
+        if kind not in springs and not isinstance(former, springs):
+            options["dilatation"] = getattr(former, "dilatation", AUTO)
+        if kind is Corotated and (rotations := wanted["rotations"]) != OWN:
+            if rotations != "auto":
+                rotations = int(rotations) if rotations.isdecimal() else float(rotations)
+            options["rotation_level"] = rotations
+        model = former if kind in (Prestressed, Prony) else kind(**options)
         found["models"] = [model] * len(sim.bodies)
     if "weight" in changes:
         found["gravity"] = gravity if wanted["weight"] else (0.0, 0.0, 0.0)
     if changes & {"young", "poisson", "density"}:
-        poisson = wanted["poisson"] if "poisson" in changes else None
-        stiffer, heavier = wanted["young"] / now["young"], wanted["density"] / now["density"]
-        found["materials"] = [changed(body.material, stiffer, poisson, heavier) for body in sim.bodies]
+        stiffer, found["materials"] = wanted["young"] / now["young"], []
+        for material in [body.material for body in sim.bodies]:
+            stiff = [name for name in vars(material) if name.startswith(("young", "shear", "k1"))]
+            values = {name: getattr(material, name) * stiffer for name in stiff}
+            values["density"] = material.density * (wanted["density"] / now["density"])
+            if "poisson" in changes and type(material) is Isotropic:
+                values["poisson"] = wanted["poisson"]
+            found["materials"].append(replace(material, **values))
     return found
-
-
-def collapses(tissue: dict[str, Any], gravity: Sequence[float], size: float) -> bool:
-    """Whether bodies of a size [m] would hardly keep their shape under gravity [m/s^2]."""
-    weight = tissue["density"] * float(np.linalg.norm(gravity)) * size if tissue["weight"] else 0.0
-    return weight > COLLAPSING * tissue["young"]
-
-
-def model_of(law: str, rotations: str, former: Model | None = None) -> Model:
-    """The model that the controls name; only the corotated one shares rotations, and springs share no dilatation.
-
-    Args:
-        former: The present model, whose choice of dilatation is kept.
-    """
-    kind = MODELS[law]
-    if kind in (Prestressed, Prony) and former is not None:
-        return former
-    options: dict[str, Any] = {}
-    springs = (EdgeStVK, MassSpring)
-    if kind not in springs and not isinstance(former, springs):
-        options["dilatation"] = getattr(former, "dilatation", AUTO)
-    if kind is Corotated and rotations != OWN:
-        options["rotation_level"] = _number(rotations)
-    return kind(**options)
-
-
-def changed(material: Any, stiffer: float, poisson: float | None, heavier: float = 1.0) -> Any:
-    """The material with its stiffness and its density times factors and, if it is isotropic and one is given, another
-    Poisson's ratio.
-    """
-    stiff = [name for name in vars(material) if name.startswith(("young", "shear", "k1"))]
-    values = {name: getattr(material, name) * stiffer for name in stiff}
-    values["density"] = material.density * heavier
-    if poisson is not None and type(material) is Isotropic:
-        values["poisson"] = poisson
-    return replace(material, **values)
-
-
-def _number(text: str) -> int | float | str:
-    for kind in (int, float):
-        try:
-            return kind(text)
-        except ValueError:
-            continue
-    return text
 
 
 # --- what the browser is told ----------------------------------------------------------------------------------------
@@ -407,17 +350,34 @@ def frame_told(session: Session, frame: PageFrame) -> bytes:
     return packed(header, *frame.positions, *shades)
 
 
-Command = Callable[[], None]
-
-
 # --- what the browser asks for ---------------------------------------------------------------------------------------
 
 
-def _between(low: float, high: float, given: Any, name: str, unit: str = "") -> float:
-    number = checked_number(given, name, unit)
-    if not low <= number <= high:
-        raise InputError(f"{name} is {number:g}; it must be {low:g} to {high:g}{f' [{unit}]' if unit else ''}")
-    return number
+Check = Callable[[Any, str], Any]
+#: A whole number that is not negative, and whatever a command itself checks.
+COUNT: Check = partial(checked_count, least=0)
+ANY: Check = lambda given, _: given  # noqa: E731
+
+
+def _between(low: float, high: float, unit: str = "") -> Check:
+    def check(given: Any, name: str) -> float:
+        number = checked_number(given, name, unit)
+        if not low <= number <= high:
+            raise InputError(f"{name} is {number:g}; it must be {low:g} to {high:g}{f' [{unit}]' if unit else ''}")
+        return number
+
+    return check
+
+
+def _one_of(words: Collection[str]) -> Check:
+    return partial(checked_choice, choices=words)
+
+
+def _plane(given: Any, _: str) -> Plane | None:
+    if given is None:
+        return None
+    axis, share = _one_of("xyz")(given["axis"], "axis"), _between(0.01, 0.99)(given["share"], "share")
+    return Plane("xyz".index(axis), share, checked_flag(given["flipped"], "flipped"))
 
 
 class Commands:
@@ -429,20 +389,21 @@ class Commands:
     """
 
     def __init__(self, session: Session, saving: Saving):
-        self._session, self._saving, self._options = session, saving, OnlineRemesh()
-        self._known: dict[str, Callable[[Visitor, dict[str, Any]], Command]] = {
-            "press": lambda who, asked: self._press(who.number, asked),
-            "press tool": lambda who, asked: self._press_tool(who.number, asked),
-            "move": lambda who, asked: partial(session.move, who.number, checked_vector(asked["by"], "by")),
-            "let go": lambda who, _: partial(session.let_go, who.number),
-            "release": lambda *_: session.release_all,
-            "change": lambda _, asked: self._change(asked["what"]),
-            "use tool": lambda _, asked: partial(session.use_tool, asked["name"], asked["at"]),
-            "tissue": lambda _, asked: self._tissue(asked["what"]),
-            "step": lambda *_: session.step,
-            "reset": lambda *_: session.reset,
-            "save": lambda who, asked: self._save(who, asked),
-            "end early": lambda *_: saving.end_early,
+        self._session, self._options = session, OnlineRemesh()
+        #: What does it, which attribute of the visitor it is told, if any, and the checks of its arguments.
+        self._known: dict[str, tuple[Callable[..., None], str, dict[str, Check]]] = {
+            "press": (session.press, "number", {"body": COUNT, "at": checked_vector}),
+            "press tool": (session.press_tool, "number", {"number": COUNT}),
+            "move": (session.move, "number", {"by": checked_vector}),
+            "let go": (session.let_go, "number", {}),
+            "release": (session.release_all, "", {}),
+            "change": (lambda values: session.change(**values), "", {"what": self._controls}),
+            "use tool": (session.use_tool, "", {"name": ANY, "at": ANY}),
+            "tissue": (self._switch, "", {"what": self._tissue}),
+            "step": (session.step, "", {}),
+            "reset": (session.reset, "", {}),
+            "save": (saving.save, "self", {"what": _one_of(saving.kinds), "seconds": _between(0.1, 600.0, "s")}),
+            "end early": (saving.end_early, "", {}),
         }
 
     def take(self, visitor: Visitor, asked: Any) -> None:
@@ -460,72 +421,58 @@ class Commands:
             InputError: The message asks for nothing that there is, or as the command.
         """
         try:
-            command = self._known[asked["do"]](visitor, asked)
+            act, who, checks = self._known[asked["do"]]
+            given = [check(asked[name], name) for name, check in checks.items()]
         except (KeyError, TypeError, AttributeError):
             raise InputError(f"the page asked for {shown(asked)}, which cannot be done") from None
         if asked["do"] not in ("move", "let go"):
             self._session.note = ""
-        command()
+        act(*{"": (), "number": (visitor.number,), "self": (visitor,)}[who], *given)
 
-    def _press(self, owner: int, asked: dict[str, Any]) -> Command:
-        body, at = checked_count(asked["body"], "body", 0), checked_vector(asked["at"], "at")
-        return partial(self._session.press, owner, body, at)
-
-    def _press_tool(self, owner: int, asked: dict[str, Any]) -> Command:
-        return partial(self._session.press_tool, owner, checked_count(asked["number"], "number", 0))
-
-    def _change(self, what: dict[str, Any]) -> Command:
+    def _controls(self, what: dict[str, Any], _: str) -> dict[str, Any]:
+        """Values of controls, checked."""
         session = self._session
-        checks: dict[str, Callable[[Any, str], Any]] = {
+        worlds = _one_of(list(map(str, range(session.sim.worlds))))
+        checks: dict[str, Check] = {
             "running": checked_flag,
-            "speed": partial(_between, 0.01, 1.0),
-            "hand": partial(checked_choice, choices=HANDS),
-            "radius": partial(_between, 0.0, 0.25),
-            "strength": partial(_between, 0.02, 1.0),
-            "colors": partial(checked_choice, choices=["", *session.sources]),
-            "surface": partial(checked_choice, choices=[name for each in session.surfaces for name in each]),
-            "world": partial(checked_choice, choices=list(map(str, range(session.sim.worlds)))),
-            "plane": lambda given, _: _plane(given),
+            "speed": _between(0.01, 1.0),
+            "hand": _one_of(HANDS),
+            "radius": _between(0.0, 0.25),
+            "strength": _between(0.02, 1.0),
+            "colors": _one_of(["", *session.sources]),
+            "surface": _one_of([name for each in session.surfaces for name in each]),
+            "world": lambda given, name: int(worlds(given, name)),
+            "plane": _plane,
         }
-        values = {name: checks[name](value, name) for name, value in what.items()}
-        if "world" in values:
-            values["world"] = int(values["world"])
-        return partial(session.change, **values)
+        return {name: checks[name](value, name) for name, value in what.items()}
 
-    def _tissue(self, what: dict[str, Any]) -> Command:
+    def _tissue(self, what: dict[str, Any], _: str) -> tuple[dict[str, Any], bool]:
+        """The tissue that is wanted, checked, and whether it loses its weight, under which it would collapse."""
         session, sim = self._session, self._session.sim
-        there = choices(sim)
-        checks: dict[str, Callable[[Any, str], Any]] = {
-            "law": partial(checked_choice, choices=there["laws"]),
-            "rotations": partial(checked_choice, choices=there["rotations"]),
-            "young": partial(_between, 1.0, 1e12, unit="Pa"),
-            "poisson": partial(_between, 0.0, 0.499),
-            "density": partial(_between, 1.0, 1e5, unit="kg/m^3"),
+        there, now = choices(sim), present(sim)
+        checks: dict[str, Check] = {
+            "law": _one_of(there["laws"]),
+            "rotations": _one_of(there["rotations"]),
+            "young": _between(1.0, 1e12, "Pa"),
+            "poisson": _between(0.0, 0.499),
+            "density": _between(1.0, 1e5, "kg/m^3"),
             "remesh": checked_flag,
             "weight": checked_flag,
         }
-        now = present(sim)
         wanted = now | {name: checks[name](value, name) for name, value in what.items()}
-        gravity, size = session.gravity, session.size
-        falls = "weight" not in what and collapses(wanted, gravity, size) > collapses(now, gravity, size)
-        wanted["weight"] &= not falls
+        falls = "weight" not in what and wanted["weight"]
+        if falls:
+            # Whether bodies would hardly keep their shape under gravity, and did before.
+            weight = np.linalg.norm(session.gravity) * session.size
+            before, then = (weight * each["density"] > COLLAPSING * each["young"] for each in (now, wanted))
+            falls = bool(then and not (before and now["weight"]))
+        return wanted | {"weight": wanted["weight"] and not falls}, falls
+
+    def _switch(self, asked: tuple[dict[str, Any], bool]) -> None:
+        (wanted, falls), session = asked, self._session
+        sim = session.sim
         former = [None if each is None else each.options for each in sim.remeshing.changing]
         remesh = [(each or self._options) if wanted["remesh"] else None for each in former]
-
-        def switch() -> None:
-            session.switch(**switched(sim, wanted, gravity), remesh=remesh)
-            if falls:
-                session.note = "So soft a body of this size would collapse under its weight: Weight is off now."
-
-        return switch
-
-    def _save(self, visitor: Visitor, asked: dict[str, Any]) -> Command:
-        seconds = _between(0.1, 600.0, asked["seconds"], "seconds", "s")
-        return partial(self._saving.save, visitor, checked_choice(asked["what"], "what", self._saving.kinds), seconds)
-
-
-def _plane(given: dict[str, Any] | None) -> Plane | None:
-    if given is None:
-        return None
-    axis, share = checked_choice(given["axis"], "axis", "xyz"), _between(0.01, 0.99, given["share"], "share")
-    return Plane("xyz".index(axis), share, checked_flag(given["flipped"], "flipped"))
+        session.switch(**switched(sim, wanted, session.gravity), remesh=remesh)
+        if falls:
+            session.note = "So soft a body of this size would collapse under its weight: Weight is off now."

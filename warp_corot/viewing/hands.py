@@ -24,6 +24,8 @@ from warp_corot.solvers import SymplecticEuler, largest_frequency
 
 from .shown import Pick, Shown
 
+Vector = npt.NDArray[np.float64]
+
 #: Maximum number of hands on a body at the same time, and of points in a patch.
 MOST_HANDS, MOST_POINTS = 8, 64
 #: The square of the spring's own frequency times the longest step; the limit is 4, of which elasticity takes up to 3.3.
@@ -68,70 +70,17 @@ class Springs:
         self.sim.system.changes += 2 * len(self._bodies)
         self._bodies.clear()
 
-    def hold(self, body: int, patch: HeldPatch, *, rigid: bool, strength: float = 1.0) -> Spring:
-        """Take hold of a patch as it is now.
-
-        Args:
-            body: The number of the body.
-            patch: Points of its shown surface.
-            rigid: Whether every point is held; otherwise only their mean is.
-            strength: Stiffness over the largest stable one at the time step, 0 to 1.
-
-        Raises:
-            LookupError: The maximum number of hands hold the body already.
-        """
+    def of(self, body: int) -> BodySprings:
+        """The springs of the body with this number."""
         if body not in self._bodies:
             self._bodies[body] = BodySprings(self.sim, self.shown[body])
             self.sim.system.forces.append(self._bodies[body])
-        return self._bodies[body].hold(patch, rigid, strength)
+        return self._bodies[body]
 
     def refit(self) -> None:
         """Find the stiffness again if the meshes or their nodes' masses have changed."""
-        for springs in self._bodies.values():
-            springs.refit()
-
-
-class Spring:
-    """The spring of one hand; see ``Springs.hold``.
-
-    Attributes:
-        stiffness: Stiffness of the spring, for the whole patch [N/m].
-        limit: The largest force on it [N].
-        rows: Its rows among those of the body.
-        starts: Displacements of the points when the hand took hold [m], float64 [k, 3].
-        motion: How far the hand has moved since then [m], float64 [3].
-    """
-
-    def __init__(self, owner: BodySprings, slot: int, patch: HeldPatch, rigid: bool, strength: float):
-        self._owner, self.slot, self.rows = owner, slot, slice(slot * MOST_POINTS, (slot + 1) * MOST_POINTS)
-        self.patch, self.rigid, self.strength = patch, rigid, strength
-        self.stiffness = self.damping = self.limit = 0.0
-        self.motion: npt.NDArray[np.float64] = np.zeros(3)
-        nodes, weights = owner.bound(patch)
-        self.starts = np.einsum("pn,pnc->pc", weights, owner.body.state.displacements.numpy()[nodes, :3])
-
-    def move(self, motion: npt.ArrayLike) -> None:
-        """Set the hand's distance from where it took hold [m], [3]."""
-        self.motion = np.asarray(motion, dtype=np.float64)
-        self._owner.write(self.slot)
-
-    def release(self) -> None:
-        """Release; further calls do nothing."""
-        self._owner.release(self.slot, self)
-
-    @property
-    def force(self) -> npt.NDArray[np.float64]:
-        """The force on the body in the last step [N], float64 [3]; waits for the device."""
-        return self._owner.arrays.force.numpy()[self.rows].astype(np.float64).sum(axis=0)
-
-    @property
-    def ends(self) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
-        """The middle of the patch, and the place to which the hand pulls it [m], float64 [3] each."""
-        shares = self.patch.shares
-        middle = shares @ self._owner.shown.rest[self.patch.points]
-        moved = self._owner.arrays.moved.numpy()[self.rows].astype(np.float64)
-        mean = shares @ moved[: len(shares)] if self.rigid else moved[0]
-        return middle + mean, middle + shares @ self.starts + self.motion
+        for spring in [each for springs in self._bodies.values() for each in springs.held if each is not None]:
+            spring.fit()
 
 
 class BodySprings(Attachments):
@@ -141,7 +90,7 @@ class BodySprings(Attachments):
     def __init__(self, sim: Simulation, shown: Shown):
         super().__init__(shown.body)
         self.sim, self.shown = sim, shown
-        self._held: list[Spring | None] = [None] * MOST_HANDS
+        self.held: list[SpringHand | None] = [None] * MOST_HANDS
         self._explicit_dt: float | None = None
         self.make(MOST_HANDS * MOST_POINTS)
 
@@ -149,66 +98,7 @@ class BodySprings(Attachments):
         self.arrays.nodes, self.arrays.weights = self.shown.nodes, self.shown.binding.weights
         super()._pull(kernel, inputs)
 
-    def bound(self, patch: HeldPatch) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.float64]]:
-        """The nodes that carry each point of a patch, and their weights, [k, 4] each."""
-        # Copied, since a view of a device's array may be the array itself.
-        nodes, weights = (each.numpy()[patch.points] for each in (self.shown.nodes, self.shown.binding.weights))
-        return np.array(nodes), np.array(weights, np.float64)
-
-    def hold(self, patch: HeldPatch, rigid: bool, strength: float) -> Spring:
-        if None not in self._held:
-            raise LookupError(f"{MOST_HANDS} hands hold the body already")
-        slot = self._held.index(None)
-        spring = self._held[slot] = Spring(self, slot, patch, rigid, strength)
-        own = slice(spring.rows.start, spring.rows.start + len(patch.points))
-        self.arrays.points[own].assign(patch.points.astype(np.int32))
-        self.arrays.shares[own].assign(np.where(rigid, 1.0, patch.shares).astype(np.float32))
-        self._fit(spring)
-        self.write(slot)
-        return spring
-
-    def release(self, slot: int, spring: Spring) -> None:
-        if self._held[slot] is spring:
-            self._held[slot] = None
-            self.write(slot)
-
-    def refit(self) -> None:
-        for slot, spring in enumerate(self._held):
-            if spring is not None:
-                self._fit(spring)
-                self.write(slot)
-
-    def write(self, slot: int) -> None:
-        """Copy a hand to the device."""
-        spring, rows = self._held[slot], rows_of_springs(MOST_POINTS)
-        first = slot * MOST_POINTS
-        if spring is not None:
-            shares = spring.patch.shares
-            count, of_rows = (len(shares), shares) if spring.rigid else (1, np.ones(1))
-            rows["first"], rows["count"][:count] = first + np.arange(MOST_POINTS), len(shares) // count
-            rows["target"][:count] = spring.motion + (spring.starts if spring.rigid else shares @ spring.starts)
-            for name in ("stiffness", "damping", "limit"):
-                rows[name][:count] = of_rows * getattr(spring, name)
-        given = wp.array(rows, dtype=kernels.Spring, device=self.device)
-        wp.copy(self.arrays.springs, given, dest_offset=first, count=MOST_POINTS)
-
-    def _fit(self, spring: Spring) -> None:
-        """The stiffness and the damping that are stable at the time step."""
-        nodes, weights = self.bound(spring.patch)
-        weights *= spring.patch.shares[:, None]
-        used, place = np.unique(nodes, return_inverse=True)
-        total = np.bincount(place.ravel(), np.abs(weights).ravel(), len(used))
-        mass = self.body.masses[used]
-        # The largest eigenvalue of the spring over masses for a stiffness of one: exact if the hand holds the mean,
-        # else a bound.
-        softness = float((total / mass).max() if spring.rigid else (total**2 / mass).sum())
-        dt = self._longest_step()
-        spring.stiffness = spring.strength * STIFF / (dt**2 * softness)
-        spring.limit = HARDEST * float(np.mean(self.body.material.isotropic.young)) * spring.patch.area
-        if not self.sim.system.is_implicit:
-            spring.damping = 2.0 * DAMPED * (spring.stiffness / softness) ** 0.5
-
-    def _longest_step(self) -> float:
+    def longest_step(self) -> float:
         """The explicit step that the springs must bear [s]; those of implicit steps are as stiff."""
         sim = self.sim
         if not sim.system.is_implicit:
@@ -229,34 +119,102 @@ class SpringHand:
         pick: The place.
         radius: Radius of the patch at rest [m].
         strength: Stiffness over the largest stable one at the time step, 0 to 1.
+
+    Attributes:
+        rigid: Whether every point is held; otherwise only their mean is.
+        stays: Whether it holds on when the mouse lets go.
+        stiffness: Stiffness of the spring, for the whole patch [N/m].
+        limit: The largest force on it [N].
+        rows: Its rows among those of the body.
+        starts: Displacements of the points when the hand took hold [m], float64 [k, 3].
+        motion: How far the hand has moved since then [m], float64 [3].
+
+    Raises:
+        LookupError: The maximum number of hands hold the body already.
     """
 
     rigid: ClassVar[bool] = False
     stays: ClassVar[bool] = False
 
     def __init__(self, springs: Springs, shown: Shown, pick: Pick, radius: float, strength: float = 1.0):
-        self.pick = pick
-        self._inward = -shown.normal(pick)
-        self._spring = springs.hold(pick.body, patch_around(shown, pick, radius), rigid=self.rigid, strength=strength)
-        self._before: npt.NDArray[np.float64] = np.zeros(3)
+        self._owner = owner = springs.of(pick.body)
+        if None not in owner.held:
+            raise LookupError(f"{MOST_HANDS} hands hold the body already")
+        self._slot = owner.held.index(None)
+        owner.held[self._slot] = self
+        self.rows = slice(self._slot * MOST_POINTS, (self._slot + 1) * MOST_POINTS)
+        self.pick, self.strength, self._inward = pick, strength, -shown.normal(pick)
+        self.patch = patch = patch_around(shown, pick, radius)
+        self.motion = self._before = np.zeros(3)
+        nodes, weights = self._bound()
+        self.starts = np.einsum("pn,pnc->pc", weights, owner.body.state.displacements.numpy()[nodes, :3])
+        own = slice(self.rows.start, self.rows.start + len(patch.points))
+        owner.arrays.points[own].assign(patch.points.astype(np.int32))
+        owner.arrays.shares[own].assign(np.where(self.rigid, 1.0, patch.shares).astype(np.float32))
+        self.fit()
+
+    def fit(self) -> None:
+        """Find the stiffness and the damping that are stable at the time step."""
+        owner, (nodes, weights) = self._owner, self._bound()
+        weights *= self.patch.shares[:, None]
+        used, place = np.unique(nodes, return_inverse=True)
+        total = np.bincount(place.ravel(), np.abs(weights).ravel(), len(used))
+        mass = owner.body.masses[used]
+        # The largest eigenvalue of the spring over masses for a stiffness of one: exact if the hand holds the mean,
+        # else a bound.
+        softness = float((total / mass).max() if self.rigid else (total**2 / mass).sum())
+        self.stiffness = self.strength * STIFF / (owner.longest_step() ** 2 * softness)
+        self.limit = HARDEST * float(np.mean(owner.body.material.isotropic.young)) * self.patch.area
+        is_implicit = owner.sim.system.is_implicit
+        self.damping = 0.0 if is_implicit else 2.0 * DAMPED * (self.stiffness / softness) ** 0.5
+        self._write()
 
     def begin(self) -> None:
         """Take hold again: motion counts from here."""
-        self._before = self._spring.motion
+        self._before = self.motion
 
-    def move(self, motion: npt.NDArray[np.float64]) -> None:
-        self._spring.move(self._before + motion)
+    def move(self, motion: Vector) -> None:
+        """Move to the mouse's present distance from where it was pressed [m], [3]."""
+        self.motion = self._before + motion
+        self._write()
 
     def release(self) -> None:
-        self._spring.release()
+        """Release; further calls do nothing."""
+        if self._owner.held[self._slot] is self:
+            self._owner.held[self._slot] = None
+            self._write()
 
     @property
-    def force(self) -> npt.NDArray[np.float64]:
-        return self._spring.force
+    def force(self) -> Vector:
+        """The force on the body in the last step [N], float64 [3]; waits for the device."""
+        return self._owner.arrays.force.numpy()[self.rows].astype(np.float64).sum(axis=0)
 
     @property
-    def ends(self) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
-        return self._spring.ends
+    def ends(self) -> tuple[Vector, Vector]:
+        """The middle of the patch, and the place to which the hand pulls it [m], float64 [3] each."""
+        shares = self.patch.shares
+        middle = shares @ self._owner.shown.rest[self.patch.points]
+        moved = self._owner.arrays.moved.numpy()[self.rows].astype(np.float64)
+        mean = shares @ moved[: len(shares)] if self.rigid else moved[0]
+        return middle + mean, middle + shares @ self.starts + self.motion
+
+    def _bound(self) -> tuple[npt.NDArray[np.int32], Vector]:
+        """The nodes that carry each point of the patch, and their weights, [k, 4] each."""
+        # Copied, since a view of a device's array may be the array itself.
+        shown, points = self._owner.shown, self.patch.points
+        return np.array(shown.nodes.numpy()[points]), np.array(shown.binding.weights.numpy()[points], np.float64)
+
+    def _write(self) -> None:
+        """Copy the hand to the device, or nothing if it has been released."""
+        rows, first, shares = rows_of_springs(MOST_POINTS), self.rows.start, self.patch.shares
+        if self._owner.held[self._slot] is self:
+            count, of_rows = (len(shares), shares) if self.rigid else (1, np.ones(1))
+            rows["first"], rows["count"][:count] = first + np.arange(MOST_POINTS), len(shares) // count
+            rows["target"][:count] = self.motion + (self.starts if self.rigid else shares @ self.starts)
+            for name in ("stiffness", "damping", "limit"):
+                rows[name][:count] = of_rows * getattr(self, name)
+        given = wp.array(rows, dtype=kernels.Spring, device=self._owner.device)
+        wp.copy(self._owner.arrays.springs, given, dest_offset=first, count=MOST_POINTS)
 
 
 class DragHand(SpringHand):
@@ -268,8 +226,9 @@ class PressHand(SpringHand):
 
     rigid = True
 
-    def move(self, motion: npt.NDArray[np.float64]) -> None:
-        self._spring.move(float(np.linalg.norm(motion)) * self._inward)
+    def move(self, motion: Vector) -> None:
+        self.motion = float(np.linalg.norm(motion)) * self._inward
+        self._write()
 
 
 class GraspHand(SpringHand):
@@ -301,8 +260,6 @@ def patch_around(shown: Shown, pick: Pick, radius: float) -> HeldPatch:
     area = float(areas @ there[shown.triangles].mean(axis=1))
     return HeldPatch(points.astype(np.int32), total / total.sum(), area)
 
-
-Vector = npt.NDArray[np.float64]
 
 # --- rigid tools, and the hand that moves them -----------------------------------------------------------------------
 

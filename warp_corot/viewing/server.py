@@ -93,12 +93,15 @@ class AccessControl:
                 return forbidden
             if origin is not None and urlsplit(origin).netloc != host:
                 return forbidden
-            if self.token is None or self._has_cookie(headers):
+            if self.token is None:
+                return None
+            jar = http.cookies.SimpleCookie(headers.get("Cookie") or "")
+            if (found := jar.get(self._cookie)) is not None and _are_same(found.value, quote(self.token, safe="")):
                 return None
             given = parse_qs(urlsplit(path).query).get("token", [])
         except Exception:  # a request that cannot be read is refused
             return forbidden
-        if len(given) != 1 or not self._is_token(given[0]):
+        if len(given) != 1 or not _are_same(given[0], self.token):
             return forbidden
         if (headers.get("Upgrade") or "").lower() == "websocket":
             return None
@@ -106,17 +109,9 @@ class AccessControl:
         cookie = f"{self._cookie}={quote(given[0], safe='')}; HttpOnly; SameSite=Strict; Path=/"
         return http.HTTPStatus.SEE_OTHER, {"Location": urlsplit(path).path or "/", "Set-Cookie": cookie}
 
-    def _has_cookie(self, headers: Any) -> bool:
-        jar = http.cookies.SimpleCookie(headers.get("Cookie") or "")
-        found = jar.get(self._cookie)
-        assert self.token is not None
-        return found is not None and hmac.compare_digest(
-            found.value.encode(errors="surrogatepass"), quote(self.token, safe="").encode()
-        )
 
-    def _is_token(self, given: str) -> bool:
-        assert self.token is not None
-        return hmac.compare_digest(given.encode(errors="surrogatepass"), self.token.encode())
+def _are_same(given: str, secret: str) -> bool:
+    return hmac.compare_digest(given.encode(errors="surrogatepass"), secret.encode(errors="surrogatepass"))
 
 
 def check_port(host: str, port: int) -> None:

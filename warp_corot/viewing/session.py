@@ -18,13 +18,12 @@ from warp_corot.contact.tool import Obstacle, Tool
 from warp_corot.cutting.blade import Blade
 from warp_corot.errors import InputError, UnstableError
 from warp_corot.inputs.loading import CONTACT_ON_CPU, load
-from warp_corot.io.pictures.colors import color_index
-from warp_corot.mesh.surfaces.bound import SurfaceMesh
+from warp_corot.io.pictures.colors import color_index, round_limit
 from warp_corot.simulation.remade import remade, tools_lent
 from warp_corot.simulation.simulation import Simulation
 
 from .hands import HANDS, SpringHand, Springs, ToolHand, new_tool
-from .shown import Plane, Range, Shown, Source, cut, sources, surfaces_of
+from .shown import TOO_WIDE, Plane, Shown, cut, sources, surfaces_of
 
 # --- controls in one direction, frames in the other ------------------------------------------------------------------
 
@@ -199,6 +198,8 @@ class Session:
         self._commands: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
         self.hands: dict[Any, SpringHand | ToolHand] = {}
         self.pace = RealTimeFactor()
+        self.springs: Springs
+        self._highest: float
         self.number = 0
         self._versions: list[int] = []
         self._steps_asked = 0
@@ -296,18 +297,20 @@ class Session:
 
         If a hand that stays holds that place already, the mouse moves it.
         """
-        pick = self.shown[body].pick(body, position)
+        shown = self.shown[body]
+        pick = shown.pick(body, position)
         for held, hand in list(self.hands.items()):
-            if not isinstance(hand, SpringHand) or not hand.stays:
+            if not isinstance(hand, SpringHand) or not hand.stays or hand.pick.body != body:
                 continue
-            if hand.pick.body == body and self._is_near(hand, pick):
+            apart = float(np.linalg.norm(shown.at(hand.pick, shown.rest) - shown.at(pick, shown.rest)))
+            if apart < max(self.controls.radius, 0.02) * self.size:
                 self.hands[owner] = self.hands.pop(held)
                 hand.begin()
                 return
         self.let_go(owner)
         kind = HANDS[self.controls.hand]
         radius = self.controls.radius * self.size
-        self.hands[owner] = kind(self.springs, self.shown[body], pick, radius, self.controls.strength)
+        self.hands[owner] = kind(self.springs, shown, pick, radius, self.controls.strength)
 
     def press_tool(self, owner: Any, number: int) -> None:
         """Take an obstacle with a mouse. With the hand ``grasp`` the tool also holds the tissue that is near it.
@@ -385,16 +388,22 @@ class Session:
             self.springs.refit()
         positions = [shown.read() for shown in self.shown]
         source = self.sources.get(self.controls.colors)
-        values = [self._values(source, shown) for shown in self.shown]
+        values = [
+            source.values(self.sim, shown) if source is not None and source.applies(shown.body) else None
+            for shown in self.shown
+        ]
         largest = max((float(v.max(initial=0.0)) for v in values if v is not None), default=0.0)
         least = 0.0 if source is None else max(map(source.least, self.shown))
-        highest = self._range.follow(largest, least)
+        # The colours end at a round number that follows the largest value.
+        largest = max(largest, least)
+        if largest > self._highest or largest < self._highest / TOO_WIDE:
+            self._highest = round_limit(largest)
         return PageFrame(
             number=self.number,
             positions=positions,
             triangles=[shown.triangles for shown in self.shown],
-            shades=[None if v is None else color_index(v, 0.0, highest).astype(np.uint8) for v in values],
-            highest=highest,
+            shades=[None if v is None else color_index(v, 0.0, self._highest).astype(np.uint8) for v in values],
+            highest=self._highest,
             poses=[tool.present_pose[self.controls.world] for tool in self.tools],
             time=self.sim.time,
             ratio=self.pace.ratio,
@@ -442,7 +451,8 @@ class Session:
 
     def _open(self) -> None:
         """Begin with the present simulation."""
-        self.sources, self._range = sources(), Range()
+        self.sources = sources()
+        self._highest = 0.0
         own = zip(self.sim.bodies, self._own, strict=True)
         self.surfaces = [surfaces_of(body.mesh, each) for body, each in own]
         self.shown: list[Shown] = []
@@ -452,8 +462,11 @@ class Session:
         """Show the surfaces that the controls name; hands let go."""
         if not first:
             self._close()
-        pairs = zip(self.sim.bodies, self.surfaces, strict=True)
-        self.shown = [Shown(body, self._surface(body.mesh, surfaces), self.controls.world) for body, surfaces in pairs]
+        self.shown, plane = [], self.controls.plane
+        for body, surfaces in zip(self.sim.bodies, self.surfaces, strict=True):
+            surface = surfaces.get(self.controls.surface) or next(iter(surfaces.values()))
+            surface = surface if plane is None else cut(surface, body.mesh, plane)
+            self.shown.append(Shown(body, surface, self.controls.world))
         self.springs = Springs(self.sim, self.shown)
         self.number += 1
         for shown in self.shown:
@@ -467,23 +480,8 @@ class Session:
         self._show()
         self.hands |= kept
 
-    def _surface(self, mesh: Any, surfaces: dict[str, SurfaceMesh]) -> SurfaceMesh:
-        name = self.controls.surface
-        surface = surfaces[name] if name in surfaces else next(iter(surfaces.values()))
-        return surface if self.controls.plane is None else cut(surface, mesh, self.controls.plane)
-
     def _close(self) -> None:
         self.release_all()
         self.springs.close()
         for shown in self.shown:
             shown.close()
-
-    def _values(self, source: Source | None, shown: Shown) -> npt.NDArray[np.floating] | None:
-        if source is None or not source.applies(shown.body):
-            return None
-        return source.values(self.sim, shown)
-
-    def _is_near(self, hand: SpringHand, pick: Any) -> bool:
-        shown = self.shown[pick.body]
-        apart = shown.at(hand.pick, shown.rest) - shown.at(pick, shown.rest)
-        return float(np.linalg.norm(apart)) < max(self.controls.radius, 0.02) * self.size

@@ -12,7 +12,7 @@ import warp as wp
 
 from warp_corot.body.soft_body import SoftBody
 from warp_corot.contact.reading import pressure_at_nodes
-from warp_corot.io.pictures.colors import VertexAverage, round_limit
+from warp_corot.io.pictures.colors import VertexAverage
 from warp_corot.io.write.skins import BoundSkins, OwnSurface, has_domain, joined_surfaces
 from warp_corot.mesh import TetForest
 from warp_corot.mesh.surfaces.bodies import boundary_surface
@@ -252,52 +252,40 @@ class Source:
     applies: Callable[[SoftBody], bool] = lambda _: True
 
 
-def displacement(sim: Simulation, shown: Shown) -> Values:
-    """The distances of the points from their rest positions [m]."""
-    return np.linalg.norm(shown.positions - shown.rest, axis=1)
-
-
-class NodalAverages:
-    """Values of elements [T], averaged to the nodes around them by volume, at the points of a shown surface [V]."""
-
-    def __init__(self) -> None:
-        self._averages: dict[SoftBody, tuple[int, VertexAverage]] = {}
-
-    def __call__(self, values: Values, shown: Shown) -> Values:
-        body = shown.body
-        if body not in self._averages or self._averages[body][0] != body.version:
-            self._averages[body] = body.version, VertexAverage.of(body.mesh)
-        return shown.carried(self._averages[body][1](values))
-
-
-def contact_pressure(sim: Simulation, shown: Shown) -> Values:
-    """Contact pressure in the last step [Pa]: triangles' values, averaged to nodes by area."""
-    body = shown.body
-    pressure = body.contact_pressure.numpy().reshape(body.worlds, -1)[shown.world.index]
-    nodal = pressure_at_nodes(body.contact_surface, body.world_node_count, pressure)
-    return shown.carried(nodal)
-
-
-def _least_motion(shown: Shown) -> float:
-    return LEAST_MOTION * float(np.ptp(shown.rest, axis=0).max(initial=0.0))
-
-
-def _least_stress(shown: Shown) -> float:
-    return LEAST_STRESS * float(np.mean(shown.body.material.isotropic.young))
-
-
 def sources() -> dict[str, Source]:
     """The sources by name. Sources that keep data of a body belong to one session."""
-    averages = NodalAverages()
+    known: dict[SoftBody, tuple[int, VertexAverage]] = {}
+
+    def averages(values: Values, shown: Shown) -> Values:
+        """Values of elements [T], averaged to the nodes around them by volume, at the points of a surface [V]."""
+        body = shown.body
+        if body not in known or known[body][0] != body.version:
+            known[body] = body.version, VertexAverage.of(body.mesh)
+        return shown.carried(known[body][1](values))
+
+    def least_motion(shown: Shown) -> float:
+        return LEAST_MOTION * float(np.ptp(shown.rest, axis=0).max(initial=0.0))
+
+    def least_stress(shown: Shown) -> float:
+        return LEAST_STRESS * float(np.mean(shown.body.material.isotropic.young))
+
+    def contact_pressure(_: Simulation, shown: Shown) -> Values:
+        """Contact pressure in the last step [Pa]: triangles' values, averaged to nodes by area."""
+        body = shown.body
+        pressure = body.contact_pressure.numpy().reshape(body.worlds, -1)[shown.world.index]
+        return shown.carried(pressure_at_nodes(body.contact_surface, body.world_node_count, pressure))
+
+    def moved(_: Simulation, shown: Shown) -> Values:
+        return np.linalg.norm(shown.positions - shown.rest, axis=1)
 
     def stress(sim: Simulation, shown: Shown) -> Values:
         return averages(sim.von_mises(shown.body)[shown.world.elements], shown)
 
     return {
-        "stress": Source("von Mises stress", "Pa", stress, _least_stress),
-        "displacement": Source("displacement", "m", displacement, _least_motion),
+        "stress": Source("von Mises stress", "Pa", stress, least_stress),
+        "displacement": Source("displacement", "m", moved, least_motion),
         "contact pressure": Source(
-            "contact pressure", "Pa", contact_pressure, _least_stress, lambda body: body.state.is_touched
+            "contact pressure", "Pa", contact_pressure, least_stress, lambda body: body.state.is_touched
         ),
         "level": Source(
             "level of the mesh",
@@ -306,17 +294,3 @@ def sources() -> dict[str, Source]:
             applies=lambda body: isinstance(body.mesh, TetForest),
         ),
     }
-
-
-class Range:
-    """The range of the colours: from zero to a round number that follows the largest value."""
-
-    def __init__(self) -> None:
-        self.highest = 0.0
-
-    def follow(self, largest: float, least: float) -> float:
-        """The upper end of the range, after values with this maximum; not below ``least``."""
-        largest = max(largest, least)
-        if largest > self.highest or largest < self.highest / TOO_WIDE:
-            self.highest = round_limit(largest)
-        return self.highest

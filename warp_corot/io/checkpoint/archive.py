@@ -100,6 +100,8 @@ def joined(plain: Any, arrays: Arrays) -> Any:
 Remesh = OnlineRemesh | Sequence[OnlineRemesh | None] | None
 
 FORMAT = "warp-corot checkpoint"
+#: What blades continue from.
+OF_BLADES = ("kept", "every", "unchanged")
 #: The version of checkpoints that is written, and the only one that is read.
 VERSION = 14
 
@@ -121,7 +123,13 @@ def save_checkpoint(sim: Simulation, path: str | PathLike[str], *, in_parts: boo
     if target.is_dir():
         raise InputError(f"cannot save {target}: it is a folder")
     packed = zip(sim.bodies, sim.models, sim.fields, sim.remeshing.changing, strict=True)
-    cuts = contents.pack_blades(sim.blades) | {"stable_steps": sim.stable_steps} if sim.remeshing.are_cut else None
+    cuts: dict[str, Any] | None = None
+    if sim.remeshing.are_cut:
+        cuts = {"stable_steps": sim.stable_steps, "blades": []}
+        if sim.blades is not None:
+            cuts |= {name: getattr(sim.blades, name) for name in OF_BLADES}
+            packed_blades = [contents.pack_tool(blade, True) | {"level": blade.level} for blade in sim.blades.blades]
+            cuts["blades"] = packed_blades
     plain, arrays = split(
         {
             "format": FORMAT,
@@ -172,8 +180,7 @@ def pack_body(
 
 
 def _pack_state(body: SoftBody) -> dict[str, Any]:
-    state, conditions = body.state, body.conditions
-    initial = state.initial
+    state, conditions, initial = body.state, body.conditions, body.state.initial
     return {
         "displacements": state.displacements,
         "velocities": state.velocities,
@@ -227,7 +234,11 @@ def load_checkpoint(
 
 def _rebuilt_simulation(tree: dict[str, Any], device: str | wp.Device | None, remesh: Remesh) -> Simulation:
     place = tree["device"] if device is None else device
-    touching = contents.obstacles_of(tree["contact"])
+    touched, cuts, touching = tree["contact"], tree["cuts"], dict[str, Any]()
+    blades: Any = None if cuts is None else list(map(contents.unpacked_tool, cuts["blades"]))
+    if touched is not None:
+        obstacles = list(map(contents.unpacked_tool, touched["obstacles"]))
+        touching = {"obstacles": obstacles, "contact": touched["options"]}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", StabilityWarning)  # the warning was shown when the simulation was made
         sim = Simulation(
@@ -237,7 +248,7 @@ def _rebuilt_simulation(tree: dict[str, Any], device: str | wp.Device | None, re
             gravity=tree["gravity"],
             deterministic=tree["deterministic"],
             remesh=contents.remesh_options(tree["bodies"], place, remesh, touching.get("obstacles", ())),
-            cuts=contents.blades_of(tree["cuts"]),
+            cuts=blades,
             **touching,
         )
     sim.steps_before_reset, sim.time_before_reset = tree["steps_before_reset"], tree["time_before_reset"]
@@ -252,10 +263,13 @@ def _rebuilt_simulation(tree: dict[str, Any], device: str | wp.Device | None, re
             field.state[name].assign(values)
     for name, values in tree["kept"].items():
         sim.kept[name].assign(values)
-    if tree["cuts"] is not None:
-        sim.stable_steps = tree["cuts"]["stable_steps"]
-        contents.unpack_blades(sim.blades, tree["cuts"])
-    contents.unpack_contact(sim.contact, tree["contact"])
+    if cuts is not None:
+        sim.stable_steps = cuts["stable_steps"]
+        if sim.blades is not None:
+            for name, array in sim.blades.kept.items():
+                array.assign(cuts["kept"][name])
+            sim.blades.every, sim.blades.unchanged = int(cuts["every"]), int(cuts["unchanged"])
+    contents.unpack_contact(sim.contact, touched)
     sim.guard.resume(**tree["guard"])
     sim.running.resume(**tree["running"])
     return sim

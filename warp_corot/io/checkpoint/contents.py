@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import importlib
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -26,7 +27,6 @@ from warp_corot.remesh.remeshing import OnlineRemesh
 
 if TYPE_CHECKING:
     from warp_corot.contact.tool import Tool
-    from warp_corot.cutting.blades import Blades
     from warp_corot.remesh.changing import Changing
 
 # --- meshes ----------------------------------------------------------------------------------------------------------
@@ -77,28 +77,19 @@ def unpack_mesh(packed: dict[str, Any]) -> TetForest | TetMesh:
     if packed["kind"] == "box":
         return TetForest.box(cells, size, packed["level"], origin=origin, up_axis=up_axis)
     tree, lattice, ends = Tree(**packed["tree"]), packed["lattice"], packed["node_ends"]
-    _check_tree(tree, lattice, ends)
-    more = packed["of_domain"] | {"label_names": tuple(packed["label_names"]), "detail": packed["detail"]}
-    return TetForest(cells, size, origin, lattice, ends, tree, up_axis, **more)
-
-
-def _check_tree(tree: Tree, lattice: np.ndarray, ends: np.ndarray) -> None:
-    """Check that all indices are in range, since kernels do not check.
-
-    Raises:
-        ValueError: An index or a shape is wrong.
-    """
+    # Kernels check no indices.
     count, nodes = len(tree.tets), len(lattice)
-    shapes = [tree.tets.shape, lattice.shape, ends.shape, tree.level.shape, tree.parent.shape, tree.first_child.shape]
-    if shapes != [(count, 4), (nodes, 3), (nodes, 2), *[(count,)] * 3]:
+    cut = np.zeros(count, np.int32) if tree.cut is None else tree.cut
+    of_tets = [array.shape for array in (tree.level, tree.parent, tree.first_child, cut)]
+    shapes = [tree.tets.shape, lattice.shape, ends.shape, *of_tets]
+    if shapes != [(count, 4), (nodes, 3), (nodes, 2), *[(count,)] * 4]:
         raise ValueError(f"the tree's arrays have the shapes {shapes}")
     bounds = ((tree.tets, 0, nodes), (ends, -1, nodes), (tree.parent, -1, count), (tree.first_child, -2, count - 1))
-    cut = np.zeros(count, np.int32) if tree.cut is None else tree.cut
-    if cut.shape != (count,):
-        raise ValueError(f"the tree's cuts have the shape {cut.shape}")
     for array, least, most in (*bounds, (tree.level, 0, 64), (cut, 0, 32)):
         if array.dtype.kind != "i" or (array.size and not (array.min() >= least and array.max() < most)):
             raise ValueError("an index of the tree is out of range")
+    more = packed["of_domain"] | {"label_names": tuple(packed["label_names"]), "detail": packed["detail"]}
+    return TetForest(cells, size, origin, lattice, ends, tree, up_axis, **more)
 
 
 # --- obstacles, tools, grasps, and the state of contact from which steps continue ------------------------------------
@@ -131,7 +122,10 @@ def pack_contact(contacts: Contacts | None, grasps: Sequence[Grasp]) -> dict[str
         return None
     if any(grasp.closed is not None for grasp in grasps):
         raise InputError("a grasp that an array opens and closes cannot be saved; release it first")
-    return pack_obstacles(contacts) | {
+    given = zip(contacts.obstacles.given, contacts.obstacles.tools, strict=True)
+    return {
+        "options": contacts.options,
+        "obstacles": [pack_tool(tool, each is tool) for each, tool in given],
         "kept": kept_arrays(contacts),
         "forces": [body.state.contact_forces for body in contacts.system.bodies],
         "law": {name: getattr(contacts.law, name) for name in LAW},
@@ -148,23 +142,6 @@ def pack_contact(contacts: Contacts | None, grasps: Sequence[Grasp]) -> dict[str
             for grasp in grasps
         ],
     }
-
-
-def pack_obstacles(contacts: Contacts) -> dict[str, Any]:
-    """The obstacles and the options of contact as a tree of plain values and arrays.
-
-    Raises:
-        InputError: A shape of a class of your own.
-    """
-    given = zip(contacts.obstacles.given, contacts.obstacles.tools, strict=True)
-    return {"options": contacts.options, "obstacles": [_pack_tool(tool, each is tool) for each, tool in given]}
-
-
-def obstacles_of(packed: dict[str, Any] | None) -> dict[str, Any]:
-    """The arguments ``obstacles`` and ``contact`` of a simulation."""
-    if packed is None:
-        return {}
-    return {"obstacles": list(map(_unpacked_tool, packed["obstacles"])), "contact": packed["options"]}
 
 
 def unpack_contact(contacts: Contacts | None, packed: dict[str, Any] | None) -> None:
@@ -184,29 +161,12 @@ def unpack_contact(contacts: Contacts | None, packed: dict[str, Any] | None) -> 
             array.assign(each["kept"][name])
 
 
-def pack_blades(blades: Blades | None) -> dict[str, Any]:
-    """The blades of a simulation whose bodies can be cut as a tree of plain values and arrays."""
-    if blades is None:
-        return {"blades": []}
-    packed = [_pack_tool(blade, True) | {"level": blade.level} for blade in blades.blades]
-    return {"blades": packed, "kept": blades.kept, "every": blades.every, "unchanged": blades.unchanged}
+def pack_tool(tool: Tool, moves: bool) -> dict[str, Any]:
+    """An obstacle as a tree of plain values and arrays: a tool that ``moves``, or a shape that stays.
 
-
-def blades_of(packed: dict[str, Any] | None) -> list[Any] | None:
-    """The argument ``cuts`` of a simulation."""
-    return None if packed is None else list(map(_unpacked_tool, packed["blades"]))
-
-
-def unpack_blades(blades: Blades | None, packed: dict[str, Any]) -> None:
-    """Restore what blades have done, on the present meshes."""
-    if blades is None:
-        return
-    for name, array in blades.kept.items():
-        array.assign(packed["kept"][name])
-    blades.every, blades.unchanged = int(packed["every"]), int(packed["unchanged"])
-
-
-def _pack_tool(tool: Tool, moves: bool) -> dict[str, Any]:
+    Raises:
+        InputError: A shape of a class of your own.
+    """
     shape = tool.shape
     kind = type(shape).__name__
     if kind not in SHAPES:
@@ -226,7 +186,8 @@ def _pack_tool(tool: Tool, moves: bool) -> dict[str, Any]:
     }
 
 
-def _unpacked_tool(packed: dict[str, Any]) -> Obstacle:
+def unpacked_tool(packed: dict[str, Any]) -> Obstacle:
+    """The obstacle that ``pack_tool`` packed."""
     shape = SHAPES[packed["shape"]](packed["size"], **packed["arrays"])
     place, pose = (_finite(packed[name], (7,)) for name in ("place", "pose"))
     shape.position, shape.quaternion = place[:3], place[3:]
@@ -266,10 +227,11 @@ def pack_changing(changing: Changing) -> dict[str, Any]:
     changing.body.state.adopt_positions()
     conditions, forest, options = changing.conditions, changing.forest, changing.options
     conditions.note()
-    return {
+    called = None if options.criterion is None else options.criterion.func
+    packed = {
         "is_remeshed": changing.is_remeshed,
         "options": {name: getattr(options, name) for name in PLAIN},
-        "criterion": None if options.criterion is None else _name_of(options.criterion),
+        "criterion": None if called is None else f"{called.__module__}.{called.__name__}",
         "parameters": options.parameters,
         "near": None if options.near is None else options.near.place_among_obstacles()[1],
         "conditions": conditions.kept,
@@ -280,9 +242,13 @@ def pack_changing(changing: Changing) -> dict[str, Any]:
         "activation_rows": conditions.activation.keyframes.keys,
         "at_beginning": conditions.of_present_mesh,
         "survey": changing.survey.last,
-        "initial": _pack_snapshot(forest.remembered),
-        "present": _pack_snapshot(Snapshot.of(forest.pools, forest.carriage.arrays)),
     }
+    # A snapshot's values by the names of their arrays and, after a dot, the beginning of the stretch.
+    present = Snapshot.of(forest.pools, forest.carriage.arrays)
+    for name, snapshot in (("initial", forest.remembered), ("present", present)):
+        pieces = {f"{array}.{start}": values for array, start, values in snapshot.pieces}
+        packed[name] = {"counts": snapshot.counts, "pieces": pieces}
+    return packed
 
 
 def unpack_changing(changing: Changing, packed: dict[str, Any]) -> None:
@@ -350,7 +316,12 @@ def _options(packed: dict[str, Any], device: Any, given: Any, tools: Sequence[To
     if packed["near"] is not None:
         return OnlineRemesh(**packed["options"], near=tools[packed["near"]])
     name, parameters = packed["criterion"], packed["parameters"]
-    criterion = None if name is None else _criterion(name)
+    criterion = None
+    if name is not None and name.startswith(CRITERIA):  # one of the package's own
+        module, _, function = name.rpartition(".")
+        with suppress(ImportError, AttributeError):
+            found = getattr(importlib.import_module(module), function)
+            criterion = found if isinstance(found, wp.Function) else None
     if name is not None and criterion is None and given is None:
         raise InputError(
             f"the criterion {name.rpartition('.')[2]!r} is your own function, which a checkpoint cannot hold; load "
@@ -359,28 +330,6 @@ def _options(packed: dict[str, Any], device: Any, given: Any, tools: Sequence[To
     if parameters is not None:
         parameters = wp.array(parameters, dtype=wp.float32, device=device)
     return OnlineRemesh(**packed["options"], criterion=criterion, parameters=parameters)
-
-
-def _name_of(criterion: Any) -> str:
-    return f"{criterion.func.__module__}.{criterion.func.__name__}"
-
-
-def _criterion(name: str) -> Any:
-    """The package's own criterion with this name; None if there is none."""
-    module, _, function = name.rpartition(".")
-    if not module.startswith(CRITERIA):
-        return None
-    try:
-        found = getattr(importlib.import_module(module), function)
-    except (ImportError, AttributeError):
-        return None
-    return found if isinstance(found, wp.Function) else None
-
-
-def _pack_snapshot(snapshot: Snapshot) -> dict[str, Any]:
-    """A snapshot's values by the names of their arrays and, after a dot, the beginning of the stretch."""
-    pieces = {f"{name}.{start}": values for name, start, values in snapshot.pieces}
-    return {"counts": snapshot.counts, "pieces": pieces}
 
 
 def _unpacked_snapshot(kept_in: tuple[Any, Any], packed: dict[str, Any]) -> Snapshot:

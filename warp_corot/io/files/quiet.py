@@ -58,7 +58,10 @@ def bounded(path: Path, memory: int = MEMORY) -> Iterator[None]:
         path: The file.
         memory: Minimum of the limit [bytes].
     """
-    used = _data_in_use()
+    used = None  # Linux's count of this process's data
+    with suppress(OSError):
+        lines = Path("/proc/self/status").read_text().splitlines()
+        used = next((int(line.split()[1]) << 10 for line in lines if line.startswith("VmData:")), None)
     if used is None:
         yield
         return
@@ -73,14 +76,3 @@ def bounded(path: Path, memory: int = MEMORY) -> Iterator[None]:
         yield
     finally:
         resource.setrlimit(resource.RLIMIT_DATA, before)
-
-
-def _data_in_use() -> int | None:
-    """Linux's count of this process's data [bytes]; None elsewhere."""
-    try:
-        for line in Path("/proc/self/status").read_text().splitlines():
-            if line.startswith("VmData:"):
-                return int(line.split()[1]) << 10
-    except OSError:
-        pass
-    return None

@@ -11,12 +11,11 @@ from typing import Any, Concatenate, ParamSpec, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
-from pxr import Tf, Usd, UsdGeom
+from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdShade
 
 from warp_corot.errors import InputError
 
 from .quiet import USD_MEMORY, bounded, quietly
-from .whole import check_output
 
 try:
     import fcntl
@@ -73,19 +72,18 @@ def _check_types(stage: Any, path: Path) -> None:
             if not definition or not attribute.HasAuthoredValue():
                 continue
             value, due = first_value(attribute), definition.GetTypeName()
-            if value is not None and not _is_of(value, due):
+            if value is None:
+                continue
+            # Numbers, whole numbers or text, of the same dimension and rank.
+            wanted, found = np.asarray(due.scalarType.defaultValue), np.asarray(value)
+            kinds, rank = {"f": "fiu", "i": "iu"}, wanted.ndim + int(due.isArray)
+            if due.isArray and not found.size:
+                fits = found.ndim > 0
+            else:
+                fits = found.ndim == rank and found.shape[rank - wanted.ndim :] == wanted.shape
+                fits &= found.dtype.kind in kinds.get(wanted.dtype.kind, wanted.dtype.kind)
+            if not fits:
                 raise InputError(f"{path}: {attribute.GetPath()} must be of type {due}; its values are of another type")
-
-
-def _is_of(value: Any, due: Any) -> bool:
-    """Whether a value is of a type's kind (numbers, whole numbers, text), dimension and rank."""
-    wanted = np.asarray(due.scalarType.defaultValue)
-    found = np.asarray(value)
-    kinds = {"f": "fiu", "i": "iu"}.get(wanted.dtype.kind, wanted.dtype.kind)
-    if due.isArray and not found.size:
-        return found.ndim > 0
-    rank = wanted.ndim + int(due.isArray)
-    return found.ndim == rank and found.shape[rank - wanted.ndim :] == wanted.shape and found.dtype.kind in kinds
 
 
 def free_name(name: str, taken: set[str]) -> str:
@@ -151,6 +149,36 @@ def _short(text: str) -> str:
     return text if len(text) <= 200 else f"{text[:197]}..."
 
 
+def preview_material(
+    stage: Any, path: str, color: Any = None, *, texture: Path | None = None, roughness: float | None = None
+) -> Any:
+    """A `UsdPreviewSurface` at a path: of one colour, linear [3], of a picture at the coordinates ``st``, or of the
+    prim's ``displayColor``."""
+    material, types = UsdShade.Material.Define(stage, path), Sdf.ValueTypeNames
+    shader = UsdShade.Shader.Define(stage, f"{path}/surface")
+    shader.CreateIdAttr("UsdPreviewSurface")
+    if roughness is not None:
+        shader.CreateInput("roughness", types.Float).Set(roughness)
+    diffuse = shader.CreateInput("diffuseColor", types.Color3f)
+    if color is not None:
+        diffuse.Set(Gf.Vec3f(*map(float, color)))
+    if color is None or texture is not None:
+        of_picture = texture is not None
+        reader = UsdShade.Shader.Define(stage, f"{path}/{'st' if of_picture else 'color'}")
+        reader.CreateIdAttr("UsdPrimvarReader_float2" if of_picture else "UsdPrimvarReader_float3")
+        reader.CreateInput("varname", types.String).Set("st" if of_picture else "displayColor")
+        if not of_picture:
+            diffuse.ConnectToSource(reader.ConnectableAPI(), "result")
+        else:
+            image = UsdShade.Shader.Define(stage, f"{path}/texture")
+            image.CreateIdAttr("UsdUVTexture")
+            image.CreateInput("file", types.Asset).Set(Sdf.AssetPath(str(texture)))
+            image.CreateInput("st", types.Float2).ConnectToSource(reader.CreateOutput("result", types.Float2))
+            diffuse.ConnectToSource(image.CreateOutput("rgb", types.Float3))
+    material.CreateSurfaceOutput().ConnectToSource(shader.CreateOutput("surface", types.Token))
+    return material
+
+
 def metres_per_unit(stage: Any, path: Path) -> float:
     """Length of a stage's unit [m].
 
@@ -161,17 +189,6 @@ def metres_per_unit(stage: Any, path: Path) -> float:
     if not (math.isfinite(metres) and metres > 0.0):
         raise InputError(f"{path}: metersPerUnit is {metres}; it must be a positive number")
     return metres
-
-
-def check_stage_path(path: Path) -> None:
-    """Check, before a simulation, that its result can be written.
-
-    Raises:
-        InputError: Another extension or a name that OpenUSD cannot take, a folder with this name, an output folder that
-            does not exist or is not writable, or a write-protected file.
-    """
-    usd_name(path)
-    check_output(path, STAGE_SUFFIXES)
 
 
 def take_lock(lock: int) -> None:

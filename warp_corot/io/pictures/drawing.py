@@ -203,13 +203,26 @@ def render(
         InputError: Arrays that do not fit each other, or positions that are not finite.
     """
     from PIL import Image, ImageDraw
+    from scipy.ndimage import gaussian_filter
 
     x, tri = checked_surface(positions, faces, "positions")
-    values, line = _values(scalars, len(x), tri), max(round(window.fineness), 1)
+    values, line = None, max(round(window.fineness), 1)
+    if scalars is not None:  # at the corners of faces
+        given = np.asarray(scalars, dtype=np.float64)
+        if given.shape not in ((len(x),), (len(tri),)):
+            shape, nodes, count = list(given.shape), len(x), len(tri)
+            raise InputError(f"scalars has shape {shape}; it must be [{nodes}] (nodes) or [{count}] (faces)")
+        values = given[tri] if len(given) == len(x) else np.repeat(given[:, None], 3, axis=1)
     image = np.full((window.size[1], window.size[0], 3), 255, np.uint8)
-    if ground is not None:
-        # Slightly blue.
-        image -= (_shadow(window, camera, x[tri], ground)[..., None] * np.array([53, 53, 48])).astype(np.uint8)
+    if ground is not None:  # with a soft shadow, a tight one within a wide one
+        dropped = dropped_shadow(x[tri].reshape(-1, 3), camera, ground).reshape(-1, 3, 3)
+        across = float(np.ptp(window.pixels(camera.project(dropped)[0])[..., 0]))
+        coarser = max(int(across / 120.0), 1)  # blurs are wide
+        coarse = replace(window, size=(-(-window.size[0] // coarser), -(-window.size[1] // coarser)))
+        small = (_nearest(coarse, camera, dropped)[0].numpy() >= 0).astype(np.float32)
+        blurred = sum(0.5 * gaussian_filter(small, width * across / coarser) for width in (0.017, 0.07))
+        dark = np.asarray(Image.fromarray(blurred).resize(window.size, Image.Resampling.BILINEAR))
+        image -= (dark[..., None] * np.array([53, 53, 48])).astype(np.uint8)  # slightly blue
     if square is not None:
         outline = window.pixels(camera.project(np.asarray(square, dtype=np.float64))[0])
         ends = [tuple(corner) for corner in [*outline, outline[0]]]
@@ -228,8 +241,8 @@ def render(
     fill = 0.9 * right + 0.1 * camera.world_up + 0.5 * towards
     lit = kernels.Lit()
     lit.corners, lit.rigid, lit.edge = corners, wp.vec3(*srgb_to_linear(STEEL)), 0.5 * line * edges
-    given = [x[tri[front]], _corner_normals(x, tri, front), table]
-    lit.points, lit.normals, lit.table = (wp.array(each, dtype=wp.vec3, device="cpu") for each in given)
+    vectors = [x[tri[front]], _corner_normals(x, tri, front), table]
+    lit.points, lit.normals, lit.table = (wp.array(each, dtype=wp.vec3, device="cpu") for each in vectors)
     lit.values = wp.array(shares[front], dtype=float, device="cpu")
     lit.viewer, lit.up = wp.vec3(*(camera.center + camera.distance * towards)), wp.vec3(*camera.world_up)
     lit.key, lit.fill = wp.normalize(wp.vec3(*key)), wp.normalize(wp.vec3(*fill))
@@ -297,18 +310,6 @@ def checked_surface(positions: ArrayLike, faces: ArrayLike, name: str) -> tuple[
     return x, tri
 
 
-def _values(scalars: ArrayLike | None, nodes: int, tri: NDArray[np.int64]) -> Array | None:
-    """Values at the corners of the faces [F, 3]."""
-    if scalars is None:
-        return None
-    values = np.asarray(scalars, dtype=np.float64)
-    if values.shape == (nodes,):
-        return values[tri]
-    if values.shape == (len(tri),):
-        return np.repeat(values[:, None], 3, axis=1)
-    raise InputError(f"scalars has shape {list(values.shape)}; it must be [{nodes}] (nodes) or [{len(tri)}] (faces)")
-
-
 def _corner_normals(x: Array, tri: NDArray[np.int64], chosen: NDArray[np.bool_]) -> Array:
     """Unit normals at the corners of chosen faces [n, 3, 3]: averages over the node's faces within the crease angle."""
     corners = x[tri]
@@ -337,20 +338,6 @@ def _nearest(window: Window, camera: Camera, triangles: Array) -> tuple[wp.array
     given = wp.array(corners, dtype=wp.vec3, device="cpu")
     wp.launch(kernels.find_nearest, len(triangles), [given], [found], device="cpu")
     return found, given
-
-
-def _shadow(window: Window, camera: Camera, triangles: Array, height: float) -> NDArray[np.float32]:
-    """How dark a soft shadow on the ground is, [height, width]: a tight one within a wide one."""
-    from PIL import Image
-    from scipy.ndimage import gaussian_filter
-
-    dropped = dropped_shadow(triangles.reshape(-1, 3), camera, height).reshape(triangles.shape)
-    across = float(np.ptp(window.pixels(camera.project(dropped)[0])[..., 0]))
-    coarser = max(int(across / 120.0), 1)  # blurs are wide
-    size = (-(-window.size[0] // coarser), -(-window.size[1] // coarser))
-    small = (_nearest(replace(window, size=size), camera, dropped)[0].numpy() >= 0).astype(np.float32)
-    blurred = sum(0.5 * gaussian_filter(small, width * across / coarser) for width in (0.017, 0.07))
-    return np.asarray(Image.fromarray(blurred).resize(window.size, Image.Resampling.BILINEAR))
 
 
 def _dots(

@@ -157,15 +157,6 @@ class Strip:
         self._step = step
         self._ghosts: dict[int, tuple[NDArray[Any], NDArray[Any], NDArray[np.uint8]]] = {}
 
-    def _ghost(self, index: int, picture: Picture) -> NDArray[np.uint8] | None:
-        """The silhouette at rest, which is drawn again only if it changes."""
-        if picture.rest is None:
-            return None
-        given = np.asarray(picture.rest), np.asarray(picture.faces)
-        if index not in self._ghosts or not all(map(np.array_equal, given, self._ghosts[index][:2])):
-            self._ghosts[index] = (*given, silhouette(self._window, self._cameras[index], *given))
-        return self._ghosts[index][2]
-
     def draw(self, pictures: Sequence[Picture], title: str = "") -> Image:
         """Draw a frame: as many pictures as the first one has, and its title.
 
@@ -180,12 +171,14 @@ class Strip:
             left, top = index % self._columns * self._step, self._head + index // self._columns * self._row
             options = {"ground": self._ground, **picture.options}
             options["ground"] = None if options["ground"] is False else options["ground"]
-            given = {
-                "scalars": picture.scalars,
-                "value_range": self._limits,
-                "ghost": self._ghost(index, picture),
-            } | options
-            panel = render(self._window, camera, picture.positions, picture.faces, **given)
+            ghost = None
+            if picture.rest is not None:  # its silhouette is drawn again only if it changes
+                given = np.asarray(picture.rest), np.asarray(picture.faces)
+                if index not in self._ghosts or not all(map(np.array_equal, given, self._ghosts[index][:2])):
+                    self._ghosts[index] = (*given, silhouette(self._window, camera, *given))
+                ghost = self._ghosts[index][2]
+            options = {"scalars": picture.scalars, "value_range": self._limits, "ghost": ghost} | options
+            panel = render(self._window, camera, picture.positions, picture.faces, **options)
             image.paste(Image.fromarray(panel).reduce(FINENESS), (left, top + self._own_head))
             if picture.title:
                 line, font = fit_line(picture.title, self._step - 16, MIDDLE)
@@ -225,12 +218,6 @@ def check_film(path: Path) -> None:
         raise InputError(f'{path}: films as .mp4 need: pip install "warp-corot[film]"; a .gif needs no package')
 
 
-def frames_shown(path: Path, frames: list[int], fps: float) -> tuple[list[int], float]:
-    """The frames that a film shows, and their number per second."""
-    every = max(int(np.ceil(fps / GIF_FPS - 1e-9)), 1) if path.suffix.lower() == ".gif" else 1
-    return frames[::every], fps / every
-
-
 def write_film(path: Path, images: Iterator[Image], fps: float) -> None:
     """Write a film, completely or not at all.
 
@@ -243,7 +230,16 @@ def write_film(path: Path, images: Iterator[Image], fps: float) -> None:
         OSError: It cannot be written; a former film stays.
     """
     with written_whole(path) as part:
-        (_write_gif if path.suffix.lower() == ".gif" else _write_mp4)(part, images, fps)
+        if path.suffix.lower() == ".gif":
+            _write_gif(part, images, fps)
+            return
+        from imageio.v2 import get_writer
+
+        options = {"codec": "libx264", "quality": 8, "macro_block_size": 2, "ffmpeg_log_level": "error"}
+        writer: Any
+        with get_writer(part, format="FFMPEG", mode="I", fps=fps, **options) as writer:
+            for image in images:
+                writer.append_data(np.asarray(image))
 
 
 def _write_gif(path: Path, images: Iterator[Image], fps: float) -> None:
@@ -261,13 +257,3 @@ def _write_gif(path: Path, images: Iterator[Image], fps: float) -> None:
     flat[0].save(
         path, format="GIF", save_all=True, append_images=flat[1:], duration=10 * hundredths, loop=0, optimize=True
     )
-
-
-def _write_mp4(path: Path, images: Iterator[Image], fps: float) -> None:
-    from imageio.v2 import get_writer
-
-    options = {"codec": "libx264", "quality": 8, "macro_block_size": 2, "ffmpeg_log_level": "error"}
-    writer: Any
-    with get_writer(path, format="FFMPEG", mode="I", fps=fps, **options) as writer:
-        for image in images:
-            writer.append_data(np.asarray(image))

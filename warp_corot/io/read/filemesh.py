@@ -120,15 +120,29 @@ class LoadedVolume:
     source: Path = Path()
 
 
-def joined_triangles(parts: Iterable[tuple[str, NDArray[Any], NDArray[Any]]], **about: Any) -> FileMesh:
-    """Surfaces, each with a name, points [N, 3] and triangles [T, 3], as one file's; ``about`` are more attributes."""
-    points, blocks, objects, offset = [np.empty((0, 3))], [], [], 0
-    for name, own, triangles in parts:
-        points.append(np.asarray(own, np.float64).reshape(-1, 3))
-        blocks.append(Block("triangle", np.asarray(triangles, np.int64).reshape(-1, 3) + offset))
-        objects.append((name, len(triangles)))
-        offset += len(own)
-    return FileMesh(np.concatenate(points), blocks, objects=objects, **about)
+def joined_meshes(parts: Iterable[tuple[str, FileMesh]], **about: Any) -> FileMesh:
+    """Meshes that share no nodes, each with a name, as one file's; ``about`` replaces attributes of it."""
+    points, blocks, objects, notes, offset = [np.empty((0, 3))], list[Block](), list[tuple[str, int]](), list[str](), 0
+    sets, ignored = dict[str, list[NDArray[np.int64]]](), dict[str, int]()
+    for name, mesh in parts:
+        points.append(mesh.points)
+        blocks += [replace(block, nodes=block.nodes + offset) for block in mesh.blocks]
+        objects.append((name, sum(len(block.nodes) for block in mesh.blocks)))
+        for known, nodes in mesh.node_sets.items():
+            sets.setdefault(known, []).append(nodes + offset)
+        for kind, count in mesh.ignored.items():
+            ignored[kind] = ignored.get(kind, 0) + count
+        notes += mesh.notes
+        offset += len(mesh.points)
+    of_all = {known: np.concatenate(nodes) for known, nodes in sets.items()}
+    found = {"ignored": ignored, "notes": list(dict.fromkeys(notes)), "node_sets": of_all, "objects": objects}
+    return FileMesh(np.concatenate(points), blocks, **found | about)
+
+
+def mesh_of_triangles(points: NDArray[Any], triangles: NDArray[Any]) -> FileMesh:
+    """Points [N, 3] and triangles [T, 3] as a file's."""
+    block = Block("triangle", np.asarray(triangles, np.int64).reshape(-1, 3))
+    return FileMesh(np.asarray(points, np.float64).reshape(-1, 3), [block])
 
 
 def sets_of_numbers(name: str, values: NDArray[np.int64]) -> dict[str, NDArray[np.int64]]:
@@ -200,7 +214,13 @@ def split_solids(
         if block.kind == "tetra":
             made, whose = block.nodes, np.arange(len(block.nodes))
         else:
-            made, whose = _cones(block)
+            # Cones from the lowest node over the triangles of the faces without it.
+            nodes, outsides = block.nodes, OUTSIDES[block.kind]
+            parts = [nodes[:, None, face] if len(face) == 3 else _halves(nodes[:, face]) for face in outsides]
+            triangles, apex = np.concatenate(parts, axis=1), nodes.min(axis=1)[:, None, None]
+            away = (triangles != apex).all(axis=2)
+            cones = np.concatenate([triangles, np.broadcast_to(apex, (*triangles.shape[:2], 1))], axis=2)
+            made, whose = cones[away], np.nonzero(away)[0]
             made, folded = _wound_alike(made, whose, len(block.nodes), points)
             warped += folded
             whole = (np.diff(np.sort(made, axis=1), axis=1) > 0).all(axis=1)
@@ -217,26 +237,6 @@ def triangles_of(blocks: Iterable[Block]) -> NDArray[np.int64]:
     for block in blocks:
         found.append(block.nodes if block.kind == "triangle" else _halves(block.nodes).reshape(-1, 3))
     return np.concatenate(found)
-
-
-def _cones(block: Block) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    nodes, outsides = block.nodes, OUTSIDES[block.kind]
-    lowest = np.argmin(nodes, axis=1)
-    tets, whose = [np.empty((0, 4), np.int64)], [np.empty(0, np.int64)]
-    for corner in range(nodes.shape[1]):
-        cells = np.flatnonzero(lowest == corner)
-        if not len(cells):
-            continue
-        for face in outsides:
-            if corner in face:
-                continue
-            corners = nodes[cells][:, face]
-            triangles = corners[:, None] if len(face) == 3 else _halves(corners)
-            apex = np.broadcast_to(nodes[cells, corner][:, None, None], (*triangles.shape[:2], 1))
-            tets.append(np.concatenate([triangles, apex], axis=2).reshape(-1, 4))
-            whose.append(np.repeat(cells, triangles.shape[1]))
-    order = np.argsort(np.concatenate(whose), kind="stable")
-    return np.concatenate(tets)[order], np.concatenate(whose)[order]
 
 
 def _halves(quads: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -337,7 +337,7 @@ def read_mesh_file(path: Path) -> FileMesh | LoadedVolume:
             continue
         found, reason = read_with(reader.module, path)
         if isinstance(found, LoadedVolume):
-            return found
+            return _checked_volume(found, path)
         if found is not None and len(found.points):
             return checked_mesh(found, path)
         if found is not None:
@@ -421,11 +421,11 @@ def load_volume(path: str | PathLike[str]) -> LoadedVolume:
     image = read_mesh_file(source)
     if not isinstance(image, LoadedVolume):
         raise InputError(f"{source}: holds a mesh; it must be an image")
-    return volume_of_image(source, image)
+    return image
 
 
-def volume_of_image(source: Path, image: LoadedVolume) -> LoadedVolume:
-    """The volume of a file's voxels.
+def _checked_volume(image: LoadedVolume, source: Path) -> LoadedVolume:
+    """The volume of a file's voxels, with its name.
 
     Raises:
         InputError: See `load_volume`.

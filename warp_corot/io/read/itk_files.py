@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import re
 from dataclasses import replace
@@ -38,22 +39,19 @@ def read(path: Path) -> LoadedVolume:
         # ITK names itself and its source files first; the reason comes last.
         raise Unreadable(re.split(r"(?:sitk::|ITK )ERROR:", str(error))[-1]) from None
     if path.name.lower().endswith((".nii", ".nii.gz")):
-        return _as_nifti_says(image, _header(str(path)))
+        # ITK converts lengths to mm; the header names the unit and the orientation.
+        header = _header(str(path))
+        unit, *codes = (int(header.GetMetaData(key)) for key in ("xyzt_units", "qform_code", "sform_code"))
+        image = replace(image, unit="mm" if unit & 7 in (1, 2, 3) else None, notes=[])
+        if any(codes):
+            return image
+        note = "the header gives no orientation: its axes are taken as right, anterior, superior"
+        return replace(image, affine=np.diag([*header.GetSpacing()[:3], 1.0]), notes=[note])
     if path.suffix.lower() != ".dcm":
         return image
     if image.values.shape[2] < 2:
         raise Unreadable("it has a single slice; name the folder with the whole series")
     return replace(image, unit="mm")
-
-
-def _as_nifti_says(image: LoadedVolume, header: Any) -> LoadedVolume:
-    """The image of a NIfTI file, whose lengths ITK converts to mm, with the unit and the orientation that it names."""
-    unit, *codes = (int(header.GetMetaData(key)) for key in ("xyzt_units", "qform_code", "sform_code"))
-    image = replace(image, unit="mm" if unit & 7 in (1, 2, 3) else None, notes=[])
-    if any(codes):
-        return image
-    note = "the header gives no orientation: its axes are taken as right, anterior, superior"
-    return replace(image, affine=np.diag([*header.GetSpacing()[:3], 1.0]), notes=[note])
 
 
 def _voxels(image: Any, notes: list[str]) -> LoadedVolume:
@@ -70,14 +68,21 @@ def _voxels(image: Any, notes: list[str]) -> LoadedVolume:
 
 
 def _series(folder: Path) -> LoadedVolume:
-    series = _all_series(folder)
+    series: list[tuple[str, ...]] = []
+    for below, _, names in itertools.islice(os.walk(folder), MOST_FOLDERS):
+        if any(_may_be_slice(Path(below) / name) for name in names):
+            made = SimpleITK.ImageSeriesReader
+            series += [made.GetGDCMSeriesFileNames(below, number) for number in made.GetGDCMSeriesIDs(below)]
+    series = [files for files in series if len(files)]
     if not series:
         raise Unreadable("it has none; name a file, or a folder with one")
     files = max(series, key=len)
     reader = SimpleITK.ImageSeriesReader()
     reader.SetFileNames(files)
     image = reader.Execute()
-    notes = [f"{len(files)} slices{_described(files[0])}"]
+    header = _header(files[0])
+    words = [header.GetMetaData(key).strip() for key in (MODALITY, DESCRIPTION) if header.HasMetaDataKey(key)]
+    notes = [f"{len(files)} slices" + (f" ({', '.join(filter(None, words))})" if any(words) else "")]
     if len(series) > 1:
         notes.append(f"the largest of {len(series)} series in {folder} is used; for another, name its own folder")
     uneven = _unevenness(files)
@@ -97,29 +102,11 @@ def _may_be_slice(path: Path) -> bool:
         return False
 
 
-def _all_series(folder: Path) -> list[tuple[str, ...]]:
-    found = []
-    for count, (below, _, files) in enumerate(os.walk(folder)):
-        if count >= MOST_FOLDERS:
-            break
-        if not any(_may_be_slice(Path(below) / name) for name in files):
-            continue
-        for name in SimpleITK.ImageSeriesReader.GetGDCMSeriesIDs(below):
-            found.append(SimpleITK.ImageSeriesReader.GetGDCMSeriesFileNames(below, name))
-    return [files for files in found if len(files)]
-
-
 def _header(file: str) -> Any:
     reader = SimpleITK.ImageFileReader()
     reader.SetFileName(file)
     reader.ReadImageInformation()
     return reader
-
-
-def _described(file: str) -> str:
-    header = _header(file)
-    words = [header.GetMetaData(key).strip() for key in (MODALITY, DESCRIPTION) if header.HasMetaDataKey(key)]
-    return f" ({', '.join(filter(None, words))})" if any(words) else ""
 
 
 def _unevenness(files: tuple[str, ...]) -> float | None:

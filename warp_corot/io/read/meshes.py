@@ -5,7 +5,6 @@ from __future__ import annotations
 import importlib.util
 import logging
 import os
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from os import PathLike
 from pathlib import Path
@@ -22,7 +21,8 @@ from .filemesh import (
     FileMesh,
     LoadedVolume,
     checked_mesh,
-    joined_triangles,
+    joined_meshes,
+    mesh_of_triangles,
     read_mesh_file,
     split_solids,
     suffix_of,
@@ -39,26 +39,26 @@ class Asset:
     Attributes:
         name: Short name, after ``warp:``.
         file: Path below Warp's package folder.
-        scale: Factor on the file's coordinates.
         young: Young's modulus [Pa].
+        duration: Simulated time [s] after which it is nearly at rest.
+        note: Explanation of the values.
+        scale: Factor on the file's coordinates.
         poisson: Poisson's ratio.
         density: Mass density [kg/m³].
         fix_below: Nodes below this height are fixed: the scaled rest coordinate along y [m].
         damping: Mass-proportional damping [1/s].
-        duration: Simulated time [s] after which it is nearly at rest.
-        note: Explanation of the values.
     """
 
     name: str
     file: str
-    scale: float
     young: float
-    poisson: float
-    density: float
-    fix_below: float
-    damping: float
     duration: float
     note: str
+    scale: float = 0.1
+    poisson: float = 0.45
+    density: float = 1000.0
+    fix_below: float = 0.01
+    damping: float = 2.0
 
     @property
     def path(self) -> Path:
@@ -68,43 +68,18 @@ class Asset:
             InputError: Warp is not installed, or lacks its examples.
         """
         spec = importlib.util.find_spec("warp")
-        folders = list(spec.submodule_search_locations or ()) if spec else []
-        for folder in folders:
-            candidate = Path(folder) / self.file
-            if candidate.is_file():
+        for folder in (spec and spec.submodule_search_locations) or ():
+            if (candidate := Path(folder, self.file)).is_file():
                 return candidate
         raise InputError(f"warp:{self.name}: {self.file} is not in the installed Warp package")
 
 
-ASSETS: dict[str, Asset] = {
-    asset.name: asset
-    for asset in [
-        Asset(
-            name="bunny",
-            file="examples/assets/bunny.usd",
-            scale=0.1,
-            young=3.0e4,
-            poisson=0.45,
-            density=1000.0,
-            fix_below=0.01,
-            damping=2.0,
-            duration=4.0,
-            note="the Stanford bunny, 16 cm long, of silicone gel",
-        ),
-        Asset(
-            name="bear",
-            file="examples/assets/bear.usd",
-            scale=0.1,
-            young=1.0e5,
-            poisson=0.45,
-            density=1000.0,
-            fix_below=0.01,
-            damping=2.0,
-            duration=5.0,
-            note="a toy bear of 55 cm of soft silicone rubber: its back sags by 9 % of its height, its nose by 14 %, "
-            "after some seconds of swaying",
-        ),
-    ]
+BUNNY = "the Stanford bunny, 16 cm long, of silicone gel"
+BEAR = """a toy bear of 55 cm of soft silicone rubber: its back sags by 9 % of its height, its nose by 14 %, after \
+some seconds of swaying"""
+ASSETS = {
+    "bunny": Asset("bunny", "examples/assets/bunny.usd", 3.0e4, 4.0, BUNNY),
+    "bear": Asset("bear", "examples/assets/bear.usd", 1.0e5, 5.0, BEAR),
 }
 
 
@@ -126,8 +101,6 @@ def find_asset(name: str | PathLike[str]) -> Asset | None:
 # --- meshes of tetrahedra and of triangles ---------------------------------------------------------------------------
 
 USD_SUFFIXES = (".usd", ".usda", ".usdc", ".usdz")
-#: Formats that only hold surfaces, see `warp_corot.io.read.meshes`.
-SURFACE_SUFFIXES = (".obj", ".stl", ".ply", ".off", ".glb", ".gltf")
 #: The mesh formats that messages name.
 USUAL = (".msh", ".vtk", ".vtu", ".inp", ".mesh", ".node")
 #: End of the note about split cells.
@@ -175,17 +148,20 @@ class LoadedMesh:
 
 
 def _opened(
-    path: str | PathLike[str], kind: str, read: Callable[[Path], Any], found: FileMesh | None
-) -> tuple[Asset | None, Path, FileMesh]:
-    """The asset with a name, the file, and what it holds, if its points are finite."""
+    path: str | PathLike[str], kind: str, found: FileMesh | None
+) -> tuple[FileMesh, Path, str, float, list[str]]:
+    """What a file holds, if its points are finite; the file, its short name, and an asset's scale and note."""
     asset = find_asset(path)
     source = asset.path if asset else checked_path(path, "path")
     check_file(source, kind)
-    mesh = read(source) if found is None else found
+    mesh = read_file(source, kind) if found is None else found
     if not isinstance(mesh, FileMesh):
         raise InputError(f"{source}: has no {'triangles' if kind == 'surface' else 'tetrahedra'} (it holds an image)")
     check_finite(mesh.points, source)
-    return asset, source, mesh
+    if asset is None:
+        # UTF-8 in every locale; characters that cannot be shown become question marks.
+        return mesh, source, os.fsencode(source.stem).decode("utf-8", "replace"), 1.0, []
+    return mesh, source, asset.name, asset.scale, [f"scaled by {asset.scale:g}: {asset.note}"]
 
 
 def load_tets(
@@ -208,7 +184,7 @@ def load_tets(
         unit: Unit of the coordinates, any length such as "mm" or "3.2cm", or metres as a number. None: the file's unit,
             or metres if it has none.
         regions: Name of the file's array of region numbers; None: the likeliest.
-        found: The result of `read_tetrahedra`, if the file was read before.
+        found: The result of `read_file`, if the file was read before.
 
     Returns:
         The mesh. Elements are not checked here (orientation, volume): `TetMesh` does that.
@@ -219,7 +195,7 @@ def load_tets(
     """
     if not 0.0 < checked_number(scale, "scale") < np.inf:
         raise InputError(f"scale is {scale}; it must be a positive number")
-    asset, source, mesh = _opened(path, "mesh", read_tetrahedra, found)
+    mesh, source, name, _, _ = _opened(path, "mesh", found)
     if not mesh.solids:
         is_stage = source.suffix.lower() in USD_SUFFIXES
         kinds = "no TetMesh prim and no Mesh prim with tetraIndices" if is_stage else f"cell types: {mesh.kinds()}"
@@ -250,8 +226,7 @@ def load_tets(
         numbered = find_regions(mesh, cells, regions)
     except InputError as error:
         raise InputError(f"{source}: {error}") from None
-    name, objects = asset.name if asset else short_name(source), mesh.objects or _objects(mesh, cells)
-    about = (mesh.up_axis or "Z", name, source, notes, objects, numbered, mesh.node_sets)
+    about = (mesh.up_axis or "Z", name, source, notes, mesh.objects or _objects(mesh, cells), numbered, mesh.node_sets)
     return LoadedMesh(points, tets.astype(np.int32), mesh.metres, *about)
 
 
@@ -266,7 +241,7 @@ def load_surface(path: str | PathLike[str], *, found: FileMesh | None = None) ->
         InputError: The file does not exist, has another format, cannot be read, or has no triangles; one line says
             which.
     """
-    asset, source, mesh = _opened(path, "surface", read_surface, found)
+    mesh, source, title, scale, scaled = _opened(path, "surface", found)
     if mesh.solids:
         raise InputError(f"{source}: has cells with volume, which TetMesh.load reads; it must have only triangles")
     blocks = sorted(mesh.faces, key=lambda block: int(block.data.get("block", np.zeros(1))[0]))
@@ -274,44 +249,14 @@ def load_surface(path: str | PathLike[str], *, found: FileMesh | None = None) ->
     if not len(triangles):
         raise InputError(f"{source}: has no triangles")
     used, renumbered = np.unique(triangles, return_inverse=True)
-    points, notes = mesh.points[used], list(mesh.notes)
     objects: dict[str, int] = {}
     for number, name in mesh.names.get("block", {}).items():
         own = [block for block in blocks if number in block.data.get("block", ())]
         if own:
             objects[name if name not in objects else f"{name} {number}"] = len(triangles_of(own))
-    if asset:
-        points = points * asset.scale
-        notes.append(f"scaled by {asset.scale:g}: {asset.note}")
-    about = (mesh.up_axis, asset.name if asset else short_name(source), source, notes)
-    objects_of = mesh.objects or list(objects.items())
-    return LoadedMesh(points, renumbered.reshape(-1, 3).astype(np.int32), mesh.metres, *about, objects_of)
-
-
-def read_tetrahedra(path: Path) -> FileMesh | LoadedVolume:
-    """The content of a mesh file; of a USD stage, its tetrahedra.
-
-    Raises:
-        InputError: Another format, or it cannot be read.
-    """
-    suffix = path.suffix.lower()
-    if suffix in USD_SUFFIXES:
-        from warp_corot.io.read.usd.meshes import read_usd_tets
-
-        return read_usd_tets(path)
-    if suffix in SURFACE_SUFFIXES:
-        raise InputError(f"{path}: is not a mesh of tetrahedra but a surface, which Domain.from_surface reads")
-    if suffix_of(path) is None and not path.is_dir():
-        raise InputError(
-            f"{path}: unknown format {path.suffix or '(no extension)'}; it must be {', '.join(USD_SUFFIXES)}, "
-            f"{', '.join(USUAL)}, another mesh file, a surface such as .stl or a scan such as .nii.gz"
-        )
-    return read_mesh_file(path)
-
-
-def short_name(path: Path) -> str:
-    """The name of a file for a title: UTF-8 in every locale; characters that cannot be shown become question marks."""
-    return os.fsencode(path.stem).decode("utf-8", "replace")
+    about = (mesh.up_axis, title, source, [*mesh.notes, *scaled], mesh.objects or list(objects.items()))
+    cells = renumbered.reshape(-1, 3).astype(np.int32)
+    return LoadedMesh(mesh.points[used] * scale, cells, mesh.metres, *about)
 
 
 def check_file(source: Path, kind: str) -> None:
@@ -369,37 +314,37 @@ UP_AXES = {".obj": "Y", ".stl": "Z", ".ply": "Z", ".off": "Z", ".glb": "Y", ".gl
 GLTF = (".glb", ".gltf")
 
 
-def read_surface(path: Path) -> FileMesh | LoadedVolume:
-    """The triangles of a file: of USD stages those of Mesh prims.
+def read_file(path: Path, kind: str = "") -> FileMesh | LoadedVolume:
+    """What a file holds: cells with volume, or else triangles, or the voxels of a VTK file with an image.
+
+    Args:
+        path: The file.
+        kind: "mesh": of a USD stage, its tetrahedra. "surface": of a USD stage, the triangles of its Mesh prims. "":
+            what there is.
 
     Raises:
         InputError: Another format, or it cannot be read.
     """
     suffix = path.suffix.lower()
     if suffix in USD_SUFFIXES:
-        from warp_corot.io.read.usd.meshes import read_usd_surface
+        from warp_corot.io.read.usd.meshes import read_usd_surface, read_usd_tets
 
-        return checked_mesh(read_usd_surface(path), path)
+        tets = None if kind == "surface" else read_usd_tets(path)
+        return tets if tets and (tets.solids or kind == "mesh") else checked_mesh(read_usd_surface(path), path)
     if suffix in UP_AXES:
+        if kind == "mesh":
+            raise InputError(f"{path}: is not a mesh of tetrahedra but a surface, which Domain.from_surface reads")
         about = {"metres": 1.0, "up_axis": UP_AXES[suffix]} if suffix in GLTF else {}
         placed = [(node, mesh.copy().apply_transform(matrix)) for mesh, matrix, node, _ in placed_meshes(path)]
-        return checked_mesh(joined_triangles(((node, m.vertices, m.faces) for node, m in placed), **about), path)
-    if suffix_of(path) is not None:
-        return read_mesh_file(path)
-    known = ", ".join((*UP_AXES, *USD_SUFFIXES))
-    raise InputError(f"{path}: unknown format {suffix or '(no extension)'}; it must be {known}")
-
-
-def read_file(path: Path) -> FileMesh | LoadedVolume:
-    """What a file holds: cells with volume, or else triangles, or the voxels of a VTK file with an image.
-
-    Raises:
-        InputError: Another format, or it cannot be read.
-    """
-    if path.suffix.lower() not in (*USD_SUFFIXES, *UP_AXES):
-        return read_tetrahedra(path)
-    tets = read_tetrahedra(path) if path.suffix.lower() in USD_SUFFIXES else None
-    return tets if isinstance(tets, FileMesh) and tets.solids else read_surface(path)
+        parts = [(node, mesh_of_triangles(mesh.vertices, mesh.faces)) for node, mesh in placed]
+        return checked_mesh(joined_meshes(parts, **about), path)
+    if suffix_of(path) is None and not path.is_dir():
+        known = ", ".join((*UP_AXES, *USD_SUFFIXES))
+        if kind != "surface":
+            usual = ", ".join((*USD_SUFFIXES, *USUAL))
+            known = f"{usual}, another mesh file, a surface such as .stl or a scan such as .nii.gz"
+        raise InputError(f"{path}: unknown format {path.suffix or '(no extension)'}; it must be {known}")
+    return read_mesh_file(path)
 
 
 def placed_meshes(path: Path, **options: Any) -> list[tuple[Any, NDArray[Any], str, str]]:
@@ -471,7 +416,9 @@ def find_regions(mesh: FileMesh, cells: NDArray[np.int64], wanted: str | None = 
     known = dict.fromkeys(name for block in mesh.solids for name in block.data)
     if wanted is not None and wanted not in known:
         raise InputError(f"there is no array {wanted!r} of whole numbers; there are: {', '.join(known) or 'none'}")
-    for name in sorted(known, key=_likelihood) if wanted is None else [wanted]:
+    likely = {name: [place for place, usual in enumerate(LIKELY) if usual in name.lower()] for name in known}
+    ordered = sorted(known, key=lambda name: (min(likely[name], default=len(LIKELY)), name.lower()))
+    for name in ordered if wanted is None else [wanted]:
         values = np.concatenate([block.data.get(name, np.zeros(len(block.nodes), np.int64)) for block in mesh.solids])
         there, said = np.unique(values), mesh.names.get(name, {})
         # Zero without a name means none: a cell of no physical group or set.
@@ -486,9 +433,3 @@ def find_regions(mesh: FileMesh, cells: NDArray[np.int64], wanted: str | None = 
         place[np.searchsorted(there, numbers)] = np.arange(1, len(numbers) + 1)
         return Regions(name, tuple(names), tuple(numbers), place[np.searchsorted(there, values[cells])])
     return None
-
-
-def _likelihood(name: str) -> tuple[int, str]:
-    lower = name.lower()
-    places = [place for place, usual in enumerate(LIKELY) if usual in lower]
-    return (min(places, default=len(LIKELY)), lower)

@@ -46,7 +46,9 @@ def read(path: Path) -> FileMesh:
     from meshio.abaqus._abaqus import read_buffer
 
     if path.suffix.lower() in (".node", ".ele"):
-        _check_pair(path)
+        for other in (path.with_suffix(".node"), path.with_suffix(".ele")):
+            if not other.is_file():
+                raise Unreadable(f"{other.name} is missing; the two files must be in one folder")
     reasons = []
     for kind in _filetypes_from_path(path):
         try:
@@ -78,8 +80,12 @@ def _mesh(mesh: Any) -> FileMesh:
             if numbers is not None and len(numbers) == len(nodes):
                 data[RENAMED.get(name, name)] = numbers
         blocks.append(Block(kind, nodes[:, : CORNERS[kind]], data))
+    # Names of physical groups, or of NetGen's materials, of dimension 3.
+    numbered = [(str(name), np.asarray(value).ravel().tolist()) for name, value in mesh.field_data.items()]
+    groups = {int(numbers[0]): name for name, numbers in numbered if len(numbers) == 2 and numbers[1] == 3}
+    array = "material" if "netgen:index" in mesh.cell_data else "physical group"
+    named = ({array: groups} if groups else {}) | ({SETS: names} if names else {})
     points = np.asarray(mesh.points, np.float64)
-    named = _names(mesh) | ({SETS: names} if names else {})
     return FileMesh(points, blocks, named, ignored, list(dict.fromkeys(notes)), _node_sets(mesh))
 
 
@@ -132,24 +138,6 @@ def _node_sets(mesh: Any) -> dict[str, NDArray[np.int64]]:
             nodes = np.unique(np.concatenate([*of_set, found.get(str(name), [])])).astype(np.int64)
             found[str(name)] = nodes
     return found | {str(name): np.asarray(nodes, np.int64) for name, nodes in mesh.point_sets.items()}
-
-
-def _names(mesh: Any) -> dict[str, dict[int, str]]:
-    """Names of physical groups, or of NetGen's materials, of dimension 3."""
-    found = {}
-    for name, value in mesh.field_data.items():
-        numbers = np.asarray(value).ravel()
-        if len(numbers) == 2 and numbers[1] == 3:
-            found[int(numbers[0])] = str(name)
-    array = "material" if "netgen:index" in mesh.cell_data else "physical group"
-    return {array: found} if found else {}
-
-
-def _check_pair(path: Path) -> None:
-    """Check that the other file of TetGen's pair exists."""
-    for other in (path.with_suffix(".node"), path.with_suffix(".ele")):
-        if not other.is_file():
-            raise Unreadable(f"{other.name} is missing; the two files must be in one folder")
 
 
 # --- Abaqus: what meshio's reader does not know -----------------------------------------------------------------------

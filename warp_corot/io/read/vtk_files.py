@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -21,19 +22,33 @@ from vtkmodules.vtkCommonDataModel import (
 from vtkmodules.vtkFiltersCore import vtkAppendFilter, vtkTriangleFilter
 from vtkmodules.vtkFiltersGeneral import vtkDataSetTriangleFilter
 
-from .filemesh import CORNERS, Block, FileMesh, LoadedVolume, Unreadable, corners_note, sets_of_numbers, whole_numbers
+from .filemesh import (
+    CORNERS,
+    Block,
+    FileMesh,
+    LoadedVolume,
+    Unreadable,
+    corners_note,
+    joined_meshes,
+    sets_of_numbers,
+    whole_numbers,
+)
 
+#: The module of VTK and its reader of files that are not XML.
+BY_SUFFIX = {".vtk": ("vtkIOLegacy", "vtkGenericDataObjectReader"), ".vtkhdf": ("vtkIOHDF", "vtkHDFReader")}
+VOXEL, PIXEL = 11, 8
+#: The order of their corners in the other kinds.
+ORDERS = {VOXEL: (0, 1, 3, 2, 4, 5, 7, 6), PIXEL: (0, 1, 3, 2)}
 #: VTK's cell types by the kind that their corners make; corners come first in cells of any order.
 KINDS = {
     "tetra": (10, 24, 71, 78, 82),
-    "hexahedron": (12, 25, 29, 33, 72, 79),
+    "hexahedron": (12, 25, 29, 33, 72, 79, VOXEL),
     "wedge": (13, 26, 31, 32, 73, 80),
     "pyramid": (14, 27, 37, 74, 81),
     "triangle": (5, 22, 34, 69, 76),
-    "quad": (9, 23, 28, 30, 70, 77),
+    "quad": (9, 23, 28, 30, 70, 77, PIXEL),
 }
-LINEAR = {10, 12, 13, 14, 5, 9}
-VOXEL, PIXEL = 11, 8
+LINEAR = {10, 12, 13, 14, 5, 9, VOXEL, PIXEL}
 #: Arrays of VTK that number neither regions nor sets of nodes.
 INTERNAL = (
     *("vtkGhostType", "vtkOriginalCellIds", "vtkOriginalPointIds"),
@@ -52,7 +67,8 @@ def read(path: Path) -> FileMesh | LoadedVolume:
     window, former = vtkStringOutputWindow(), vtkOutputWindow.GetInstance()
     vtkOutputWindow.SetInstance(window)
     try:
-        reader = _reader(path)
+        module, kind = BY_SUFFIX.get(path.suffix.lower(), ("vtkIOXML", "vtkXMLGenericDataObjectReader"))
+        reader = getattr(import_module(f"vtkmodules.{module}"), kind)()
         reader.SetFileName(str(path))
         readable = not hasattr(reader, "CanReadFile") or reader.CanReadFile(str(path))
         if readable:
@@ -62,26 +78,21 @@ def read(path: Path) -> FileMesh | LoadedVolume:
         vtkOutputWindow.SetInstance(former)
     said = _errors(window.GetOutput())
     if not readable or said or data is None:
-        raise Unreadable(said or _first_look(path))
+        start = path.read_bytes()[:64]
+        begins = f"its root element is not a VTKFile of this kind (it begins {start[:40].decode(errors='replace')!r})"
+        raise Unreadable(said or (begins if start.lstrip().startswith(b"<") else "it does not begin like XML"))
     if isinstance(data, vtkImageData):
         return _image(data)
     leaves = list(_leaves(data, ""))
     if not leaves:
         raise Unreadable(f"it holds {data.GetClassName()}, which is empty or not a mesh")
-    return _joined(leaves)
-
-
-def _reader(path: Path) -> Any:
-    from vtkmodules import vtkIOLegacy, vtkIOXML
-
-    suffix = path.suffix.lower()
-    if suffix == ".vtk":
-        return vtkIOLegacy.vtkGenericDataObjectReader()
-    if suffix == ".vtkhdf":
-        from vtkmodules import vtkIOHDF
-
-        return vtkIOHDF.vtkHDFReader()
-    return vtkIOXML.vtkXMLGenericDataObjectReader()
+    parts = [(name, _mesh(leaf)) for name, leaf in leaves]
+    if len(parts) == 1:
+        return parts[0][1]
+    for number, (_, mesh) in enumerate(parts, start=1):
+        for block in mesh.blocks:
+            block.data["block"] = np.full(len(block.nodes), number)
+    return joined_meshes(parts, objects=[], names={"block": {k: name for k, (name, _) in enumerate(parts, start=1)}})
 
 
 def _errors(said: str) -> str:
@@ -96,13 +107,6 @@ def _errors(said: str) -> str:
         if not said_of_itself.startswith("Algorithm "):  # a message that only repeats the failure
             found.append(said_of_itself)
     return "; ".join(dict.fromkeys(filter(None, found)))
-
-
-def _first_look(path: Path) -> str:
-    start = path.read_bytes()[:64]
-    if not start.lstrip().startswith(b"<"):
-        return "it does not begin like XML"
-    return f"its root element is not a VTKFile of this kind (it begins {start[:40].decode(errors='replace')!r})"
 
 
 def _leaves(data: Any, name: str) -> Iterator[tuple[str, Any]]:
@@ -123,58 +127,43 @@ def _leaves(data: Any, name: str) -> Iterator[tuple[str, Any]]:
         yield name, data
 
 
-def _joined(leaves: list[tuple[str, Any]]) -> FileMesh:
-    points: list[NDArray[np.float64]] = []
-    blocks: list[Block] = []
-    ignored: dict[str, int] = {}
-    notes: list[str] = []
-    sets: dict[str, list[NDArray[np.int64]]] = {}
-    offset = 0
-    for number, (_, data) in enumerate(leaves, start=1):
-        own = np.empty((0, 3))
-        if data.GetPoints() is not None:
-            own = np.array(vtk_to_numpy(data.GetPoints().GetData()), dtype=np.float64)
-        for array, numbers in _whole_arrays(data.GetPointData(), data.GetNumberOfPoints()).items():
-            for name, nodes in sets_of_numbers(array, numbers).items():
-                sets.setdefault(name, []).append(nodes + offset)
-        extra = {"block": number} if len(leaves) > 1 else {}
-        for block in _cells(data, ignored, notes):
-            values = {**block.data, **{name: np.full(len(block.nodes), k) for name, k in extra.items()}}
-            blocks.append(Block(block.kind, block.nodes + offset, values))
-        points.append(own)
-        offset += len(own)
-    names = {"block": {k: name for k, (name, _) in enumerate(leaves, start=1)}} if len(leaves) > 1 else {}
-    joined = {name: np.concatenate(parts) for name, parts in sets.items()}
-    return FileMesh(np.concatenate(points), blocks, names, ignored, list(dict.fromkeys(notes)), joined)
-
-
-def _cells(data: Any, ignored: dict[str, int], notes: list[str]) -> Iterator[Block]:
+def _mesh(data: Any) -> FileMesh:
+    points, sets = np.empty((0, 3)), dict[str, NDArray[np.int64]]()
+    if data.GetPoints() is not None:
+        points = np.array(vtk_to_numpy(data.GetPoints().GetData()), dtype=np.float64)
+    for array, numbers in _whole_arrays(data.GetPointData(), data.GetNumberOfPoints()).items():
+        sets |= sets_of_numbers(array, numbers)
     if isinstance(data, vtkPolyData):
         # VTK itself triangulates strips and general polygons.
         data = _filtered(vtkTriangleFilter(), data, "PassLinesOff", "PassVertsOff")
         triangles = _ints(data.GetPolys().GetConnectivityArray()).reshape(-1, 3)
-        yield Block("triangle", triangles, _data(data, np.arange(len(triangles))))
-        return
-    types = _types(data)
+        block = Block("triangle", triangles, _whole_arrays(data.GetCellData(), len(triangles)))
+        return FileMesh(points, [block], node_sets=sets)
+    types, blocks, notes, ignored = _types(data), list[Block](), list[str](), dict[str, int]()
     if found := set(types.tolist()) & MANY_FACED.keys():
         split = ", ".join(MANY_FACED[number] for number in sorted(found))
         notes.append(f"{split} are split into tetrahedra or triangles by VTK")
         data = _filtered(vtkDataSetTriangleFilter(), data)
         types = _types(data)
-    array = data.GetCells()
+    array, arrays = data.GetCells(), _whole_arrays(data.GetCellData(), data.GetNumberOfCells())
     offsets, nodes = _ints(array.GetOffsetsArray()), _ints(array.GetConnectivityArray())
     if len(offsets) != len(types) + 1 or (np.diff(offsets) < 0).any() or offsets[-1] > len(nodes):
         raise Unreadable("the offsets of its cells do not fit their number")
     kinds = {number: kind for kind, numbers in KINDS.items() for number in numbers}
     for number in np.unique(types).tolist():
-        cells = np.flatnonzero(types == number)
-        kind = {VOXEL: "hexahedron", PIXEL: "quad"}.get(number, kinds.get(number))
+        cells, kind = np.flatnonzero(types == number), kinds.get(number)
         if kind is None:
             ignored[f"VTK's type {number}" if number > 4 else "line"] = len(cells)
             continue
-        yield _corners(kind, number, cells, offsets, nodes, data)
-        if number not in LINEAR | {VOXEL, PIXEL}:
+        short = np.flatnonzero(offsets[cells + 1] - offsets[cells] < CORNERS[kind])
+        if len(short):
+            raise Unreadable(f"cell {cells[short[0]]}, a {kind}, has fewer than {CORNERS[kind]} corners")
+        order = ORDERS.get(number, range(CORNERS[kind]))
+        corners = nodes[offsets[cells][:, None] + np.array(order)]
+        blocks.append(Block(kind, corners, {name: values[cells] for name, values in arrays.items()}))
+        if number not in LINEAR:
             notes.append(corners_note(kind, 2 if number < 69 else None))
+    return FileMesh(points, blocks, ignored=ignored, notes=list(dict.fromkeys(notes)), node_sets=sets)
 
 
 def _filtered(filtering: Any, data: Any, *options: str) -> Any:
@@ -191,25 +180,6 @@ def _types(data: Any) -> NDArray[np.int64]:
     if array is None or not hasattr(array, "GetNumberOfTuples"):
         array = data.GetCellTypesArray()
     return _ints(array)
-
-
-def _corners(kind: str, number: int, cells: NDArray, offsets: NDArray, nodes: NDArray, data: Any) -> Block:
-    count = CORNERS[kind]
-    short = np.flatnonzero(offsets[cells + 1] - offsets[cells] < count)
-    if len(short):
-        raise Unreadable(f"cell {cells[short[0]]}, a {kind}, has fewer than {count} corners")
-    corners = nodes[offsets[cells][:, None] + np.arange(count)]
-    if number == VOXEL:
-        corners = corners[:, [0, 1, 3, 2, 4, 5, 7, 6]]
-    elif number == PIXEL:
-        corners = corners[:, [0, 1, 3, 2]]
-    return Block(kind, corners, _data(data, cells))
-
-
-def _data(data: Any, cells: NDArray) -> dict[str, NDArray[np.int64]]:
-    """The arrays of whole numbers, one a cell."""
-    numbers = _whole_arrays(data.GetCellData(), data.GetNumberOfCells())
-    return {name: values[cells] for name, values in numbers.items()}
 
 
 def _whole_arrays(arrays: Any, count: int) -> dict[str, NDArray[np.int64]]:

@@ -9,7 +9,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
-from importlib.metadata import PackageNotFoundError, version
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
+from warp_corot import __version__
 from warp_corot.contact.reading import contact_at_nodes
 from warp_corot.errors import InputError
 from warp_corot.inputs.checks import checked_number, checked_path, shown
@@ -32,8 +32,6 @@ from .skins import BoundSkins, has_domain
 
 if TYPE_CHECKING:
     from warp_corot.io.write.usd.pieces import ColoredStage
-    from warp_corot.io.write.usd.prims import Touched
-    from warp_corot.io.write.usd.writer import UsdWriter
 
     from .paraview import ParaViewWriter
     from .skins import Surface
@@ -96,23 +94,15 @@ class JoinedBodies:
         self, surface: Surface | Sequence[Surface | None] | None, tets: bool | None, labels: bool
     ) -> BoundSkins | None:
         """Surfaces that are drawn in place of the boundary of the tetrahedra; None if there are only tetrahedra."""
-        if self.are_plain(surface, labels) and tets is not False and not self.are_cut:
+        self.are_plain = surface is None and not labels and not any(map(has_domain, self.meshes))
+        if self.are_plain and tets is not False and not self.are_cut:
             return None
         return BoundSkins(self.meshes, surface, labels, self.changing, self.are_cut)
-
-    def are_plain(self, surface: Surface | Sequence[Surface | None] | None, labels: bool) -> bool:
-        """Whether bodies are drawn by their tetrahedra."""
-        return surface is None and not labels and not any(map(has_domain, self.meshes))
 
     @cached_property
     def average(self) -> VertexAverage:
         """The average from tetrahedra to nodes."""
         return VertexAverage.of(self)
-
-    @property
-    def moduli(self) -> tuple[Any, Any]:
-        """Young's modulus [Pa] and Poisson's ratio, numbers or [T]."""
-        return self.young, self.poisson  # type: ignore[attr-defined]
 
     def nodal(self, name: str) -> npt.NDArray[Any]:
         """An array of the bodies with a row for each node, by its name."""
@@ -132,16 +122,12 @@ class JoinedBodies:
         self.tets = self.tets.astype(np.int32)
         self.fixed = np.concatenate([w.body.constrained[w.nodes] for w in self.worlds])
         for name in ("young", "poisson", "density"):
-            setattr(self, name, self._property(name))
-
-    def _property(self, name: str) -> float | npt.NDArray[np.float64]:
-        values = []
-        for world in self.worlds:
-            body = world.body
-            everywhere = np.broadcast_to(getattr(body.material.isotropic, name), (body.worlds, len(body.mesh.tets)))
-            values.append(everywhere[world.index])
-        joined = np.concatenate(values).astype(np.float64)
-        return float(joined[0]) if (joined == joined[0]).all() else joined
+            values = []
+            for world in self.worlds:
+                body, given = world.body, getattr(world.body.material.isotropic, name)
+                values.append(np.broadcast_to(given, (body.worlds, len(body.mesh.tets)))[world.index])
+            joined = np.concatenate(values).astype(np.float64)
+            setattr(self, name, float(joined[0]) if (joined == joined[0]).all() else joined)
 
 
 def steps_per_frame(fps: float, dt: float) -> int:
@@ -252,6 +238,7 @@ def record(
         UnstableError: The state is no longer finite; the frames before are kept.
         OSError: The file cannot be written, for example because the disk is full; all but the last seconds are kept.
     """
+    from warp_corot.io.write.usd.prims import Touched
     from warp_corot.io.write.usd.writer import UsdWriter
 
     from .paraview import ParaViewWriter, frame_of
@@ -276,7 +263,7 @@ def record(
             fixed=joined.fixed,
             material=joined,
             skins=skins.on(joined.meshes) if skins else (),
-            tets=True if tets is None and joined.are_plain(surface, labels) else tets,
+            tets=True if tets is None and joined.are_plain else tets,
             changing=any(joined.changing),
             gravity=sim.gravity,
             obstacles=() if sim.contact is None else sim.contact.obstacles.given,
@@ -286,13 +273,31 @@ def record(
     done = Recording(writer.path) if recording is None else recording
     first_time = sim.total_time
 
+    @under_lock
+    def write_state() -> None:
+        touched = None
+        if sim.contact is not None:
+            drawn = zip(sim.bodies, joined.worlds, strict=True)
+            found = [contact_at_nodes(sim.contact, k, body, world.index) for k, (body, world) in enumerate(drawn)]
+            touched = Touched(*(np.concatenate(each) for each in zip(*found, strict=True)))
+        arrays = {"velocities": joined.nodal("velocities"), "von_mises": joined.von_mises(sim), "touched": touched}
+        writer.write(joined.nodal("positions"), **arrays)
+        done.frames = writer.frames
+        done.elements.append(len(joined.tets))
+        # In float64: before a state becomes infinite, squares overflow float32.
+        lengths = np.linalg.norm(joined.nodal("displacements").astype(np.float64), axis=1)
+        done.final_displacement = float(lengths.max())
+        done.largest_displacement = max(done.largest_displacement, done.final_displacement)
+
     def write() -> None:
         sim.collect()
         if joined.has_changed():
             bound = skins.on(joined.meshes) if skins else ()
             writer.change_mesh(joined, fixed=joined.fixed, material=joined, skins=bound)
-        writer.about = {**told, **steps_made(sim)}
-        _write_frame(writer, sim, joined, done)
+        shortest, longest = sim.dt_range
+        steps = {"steps": sim.total_steps, "shortestStep": float(shortest), "longestStep": float(longest)}
+        writer.about = told | steps
+        write_state()
         if also:
             shown_mesh = frame_of(sim, joined)
             for other in others:
@@ -338,33 +343,6 @@ def progress_bar(count: int, *, wanted: bool = True) -> Iterator[Progress]:
     """A bar on a terminal for long runs, to be called with numbers of frames."""
     with bar_of(count, "frames", wanted=wanted) as update, hidden():
         yield lambda frame, _: update(frame)
-
-
-@under_lock
-def _write_frame(writer: UsdWriter, sim: Simulation, joined: JoinedBodies, done: Recording) -> None:
-    writer.write(
-        joined.nodal("positions"),
-        velocities=joined.nodal("velocities"),
-        von_mises=joined.von_mises(sim),
-        touched=_touched(sim, joined),
-    )
-    done.frames = writer.frames
-    done.elements.append(len(joined.tets))
-    # In float64: before a state becomes infinite, squares overflow float32.
-    lengths = np.linalg.norm(joined.nodal("displacements").astype(np.float64), axis=1)
-    done.final_displacement = float(lengths.max())
-    done.largest_displacement = max(done.largest_displacement, done.final_displacement)
-
-
-def _touched(sim: Simulation, joined: JoinedBodies) -> Touched | None:
-    """Contact on the drawn bodies, if there is any in the simulation."""
-    from warp_corot.io.write.usd.prims import Touched
-
-    if sim.contact is None:
-        return None
-    drawn = zip(sim.bodies, joined.worlds, strict=True)
-    found = [contact_at_nodes(sim.contact, k, body, world.index) for k, (body, world) in enumerate(drawn)]
-    return Touched(*(np.concatenate(each) for each in zip(*found, strict=True)))
 
 
 @contextmanager
@@ -424,7 +402,7 @@ def provenance(sim: Simulation, held: npt.NDArray[np.bool_]) -> dict[str, Any]:
         models[f"body{number}"] = f"{type(model).__name__}({options})"
     integrator = {name: value for name, value in asdict(sim.integrator).items() if value is not None}  # type: ignore
     return {
-        "program": f"warp_corot {_version()}, warp {wp.__version__}",
+        "program": f"warp_corot {__version__}, warp {wp.__version__}",
         "units": "metres, kilograms, seconds, pascals",
         "device": f"{sim.device} ({sim.device.name})",
         "models": models,
@@ -432,16 +410,3 @@ def provenance(sim: Simulation, held: npt.NDArray[np.bool_]) -> dict[str, Any]:
         "gravity": " ".join(f"{g:.9g}" for g in sim.gravity),
         "heldNodes": int(np.count_nonzero(held)),
     }
-
-
-def steps_made(sim: Simulation) -> dict[str, Any]:
-    """The number of steps, and their lengths [s]."""
-    shortest, longest = sim.dt_range
-    return {"steps": sim.total_steps, "shortestStep": float(shortest), "longestStep": float(longest)}
-
-
-def _version() -> str:
-    try:
-        return version("warp-corot")
-    except PackageNotFoundError:
-        return "(not installed)"

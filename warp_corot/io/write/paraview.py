@@ -38,7 +38,8 @@ def frame_of(sim: Simulation, joined: JoinedBodies) -> Any:
     counts = [len(mesh.tets) for mesh in joined.meshes]
     if all(has_tensor(model, w.body.material) for model, w in zip(sim.models, joined.worlds, strict=True)):
         parts = np.split(gradients, np.cumsum(counts)[:-1])
-        moduli = [np.split(np.broadcast_to(of, sum(counts)), np.cumsum(counts)[:-1]) for of in joined.moduli]
+        given = (joined.young, joined.poisson)  # type: ignore[attr-defined]
+        moduli = [np.split(np.broadcast_to(of, sum(counts)), np.cumsum(counts)[:-1]) for of in given]
         stress = [cauchy_stress(*each) for each in zip(sim.models, parts, *moduli, strict=True)]
         elemental["stress"] = np.concatenate(stress).reshape(-1, 9).astype(np.float32)
     elemental["von_mises"] = joined.von_mises(sim)
@@ -97,7 +98,7 @@ class ParaViewWriter:
         with writing(folder):
             folder.mkdir(exist_ok=True)
         name = f"{self._path.stem}_{len(self._listed):05}.vtu"
-        write_vtu(folder / name, mesh)
+        _write(folder / name, mesh)
         file = quoteattr(f"{folder.name}/{name}")
         self._listed.append(f'    <DataSet timestep="{time:.9g}" part="0" file={file}/>')
         lines = ['<?xml version="1.0"?>', '<VTKFile type="Collection" version="0.1" byte_order="LittleEndian">']
@@ -112,16 +113,11 @@ class ParaViewWriter:
             WriteError: It could not be written.
         """
         if self._last is not None:
-            write_vtu(self._path, self._last)
+            _write(self._path, self._last)
         self._last = None
 
 
-def write_vtu(path: Path, mesh: Any) -> None:
-    """Write a mesh of meshio as a .vtu, completely or not at all.
-
-    Raises:
-        WriteError: It could not be written.
-    """
+def _write(path: Path, mesh: Any) -> None:
     import meshio
 
     with written_whole(path) as part:

@@ -165,23 +165,18 @@ class BoundSkins:
         found, offset = [], 0
         for index, mesh in enumerate(meshes):
             if mesh is not self._meshes[index]:
-                self._skins[index] = [_bound_anew(skin, mesh) for skin in self._skins[index]]
+                for place, skin in enumerate(self._skins[index]):
+                    if skin.changes and mesh.tree.cut is not None:
+                        surface = mesh.surface()
+                    else:
+                        surface = boundary_surface(mesh) if skin.is_boundary else _rebound(skin.surface, mesh)
+                    self._skins[index][place] = replace(skin, surface=surface)
                 self._meshes[index] = mesh
             for skin in self._skins[index]:
                 nodes = (skin.surface.nodes + offset).astype(np.int32)
                 found.append(replace(skin, surface=replace(skin.surface, nodes=nodes)))
             offset += len(mesh.points)
         return _joined(found)
-
-
-def _bound_anew(skin: Skin, mesh: Any) -> Skin:
-    if skin.changes and mesh.tree.cut is not None:
-        surface = mesh.surface()
-    elif skin.is_boundary:
-        surface = boundary_surface(mesh)
-    else:
-        surface = _rebound(skin.surface, mesh)
-    return replace(skin, surface=surface)
 
 
 def _one_each(surface: Any, count: int) -> list[Any]:
@@ -196,7 +191,12 @@ def _one_each(surface: Any, count: int) -> list[Any]:
 
 def _skins_of_one(mesh: Any, surface: Any, labels: bool) -> list[Skin]:
     if isinstance(surface, SurfaceMesh):
-        _check_nodes(surface, len(mesh.points))
+        lowest, highest, count = surface.nodes.min(initial=0), surface.nodes.max(initial=-1), len(mesh.points)
+        if lowest < 0 or not 0 <= highest < count:
+            raise InputError(
+                f"the surface is bound to nodes {lowest} to {highest}, the mesh has nodes 0 to {count - 1}; it must be "
+                "bound to this mesh"
+            )
         return [Skin("surface", surface)]
     if isinstance(surface, OwnSurface):
         return _bound_looks(mesh, surface.looks)
@@ -207,11 +207,8 @@ def _skins_of_one(mesh: Any, surface: Any, labels: bool) -> list[Skin]:
     if surface is not None:
         raise InputError(f"surface is a {type(surface).__name__}; it must be a SurfaceMesh or a surface file")
     if labels and has_labels(mesh) and not has_domain(mesh):
-        return [
-            Skin(name, boundary_surface(mesh, mesh.elements_of(name)))
-            for name in mesh.label_names
-            if mesh.elements_of(name).any()
-        ]
+        chosen = [(name, mesh.elements_of(name)) for name in mesh.label_names]
+        return [Skin(name, boundary_surface(mesh, own)) for name, own in chosen if own.any()]
     if labels and has_labels(mesh):
         between = mesh.separating_surface()
         there = np.unique(between.sides)
@@ -228,15 +225,6 @@ def _rebound(surface: SurfaceMesh, mesh: Any) -> SurfaceMesh:
     return replace(surface, nodes=bound.nodes, weights=bound.weights)
 
 
-def _check_nodes(surface: SurfaceMesh, count: int) -> None:
-    lowest, highest = int(surface.nodes.min(initial=0)), int(surface.nodes.max(initial=-1))
-    if lowest < 0 or not 0 <= highest < count:
-        raise InputError(
-            f"the surface is bound to nodes {lowest} to {highest}, the mesh has nodes 0 to {count - 1}; it must be "
-            "bound to this mesh"
-        )
-
-
 def _outwards(looks: Sequence[Look]) -> list[Look]:
     """The parts of a surface wound as the body that they enclose together."""
     firsts = np.cumsum([0, *(len(look.points) for look in looks)])
@@ -247,23 +235,19 @@ def _outwards(looks: Sequence[Look]) -> list[Look]:
 
 
 def _bound_looks(mesh: Any, looks: Sequence[Look]) -> list[Skin]:
-    skins = []
+    skins, low, high = [], mesh.points.min(axis=0), mesh.points.max(axis=0)
+    body = float((high - low).max())
     for look in looks:
-        _check_size(look, mesh.points)
+        size = float(np.ptp(look.points, axis=0).max())
+        apart = (look.points.min(axis=0) > high).any() or (look.points.max(axis=0) < low).any()
+        if apart or size > UNLIKELY * body:
+            raise InputError(
+                f"{look.source}: {look.path} is {size:.3g} m long and {'apart from' if apart else 'bound to'} the "
+                f"body, which is {body:.3g} m long; is its metersPerUnit right?"
+            )
         bound = mesh.bind(look.points)
         skins.append(Skin(look.name, SurfaceMesh(look.points, bound.nodes, bound.weights, look.triangles), look))
     return skins
-
-
-def _check_size(look: Look, nodes: np.ndarray) -> None:
-    low, high = nodes.min(axis=0), nodes.max(axis=0)
-    size, body = float(np.ptp(look.points, axis=0).max()), float((high - low).max())
-    apart = (look.points.min(axis=0) > high).any() or (look.points.max(axis=0) < low).any()
-    if apart or size > UNLIKELY * body:
-        raise InputError(
-            f"{look.source}: {look.path} is {size:.3g} m long and {'apart from' if apart else 'bound to'} the body, "
-            f"which is {body:.3g} m long; is its metersPerUnit right?"
-        )
 
 
 def _joined(skins: Sequence[Skin]) -> list[Skin]:

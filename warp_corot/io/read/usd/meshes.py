@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdShade, Vt
+from pxr import Sdf, Tf, Usd, UsdGeom, UsdShade, Vt
 
 from warp_corot.errors import InputError
 from warp_corot.io.files.usd import (
@@ -19,10 +19,11 @@ from warp_corot.io.files.usd import (
     in_world,
     metres_per_unit,
     open_stage,
+    preview_material,
     reads_stage,
     world_matrix,
 )
-from warp_corot.io.read.filemesh import Block, FileMesh, joined_triangles, sets_of_numbers
+from warp_corot.io.read.filemesh import Block, FileMesh, joined_meshes, mesh_of_triangles, sets_of_numbers
 from warp_corot.io.read.meshes import UP_AXES, USD_SUFFIXES, placed_meshes
 
 # --- surfaces --------------------------------------------------------------------------------------------------------
@@ -37,8 +38,8 @@ def read_usd_surface(path: Path) -> FileMesh:
     """
     stage = open_stage(path)
     looks = list(looks_of(stage, path, 1.0))
-    return joined_triangles(
-        [(look.name, look.points, look.triangles) for look in looks],
+    return joined_meshes(
+        [(look.name, mesh_of_triangles(look.points, look.triangles)) for look in looks],
         notes=[f"{look.path} is a subdivision surface; its control mesh is used" for look in looks if look.smooth],
         metres=metres_per_unit(stage, path),
         up_axis=str(UsdGeom.GetStageUpAxis(stage)),
@@ -89,11 +90,7 @@ def read_usd_tets(path: Path) -> FileMesh:
         InputError: The file is not a USD stage, or its indices are not a multiple of four or name no points.
     """
     stage = open_stage(path)
-    all_points: list[NDArray[np.float64]] = [np.empty((0, 3))]
-    blocks: list[Block] = []
-    prims: list[tuple[str, int]] = []
-    sets: dict[str, list[NDArray[np.int64]]] = {}
-    offset = 0
+    parts: list[tuple[str, FileMesh]] = []
     for prim in stage.Traverse(Usd.TraverseInstanceProxies()):
         indices = _tet_indices(prim, path)
         if indices is None or len(indices) == 0:
@@ -102,21 +99,12 @@ def read_usd_tets(path: Path) -> FileMesh:
         if indices.min() < 0 or indices.max() >= len(points):
             bad = indices[(indices < 0) | (indices >= len(points))][0]
             raise InputError(f"{path}: prim {prim.GetPath()} names point {bad} but has points 0 to {len(points) - 1}")
-        all_points.append(in_world(prim, points))
-        blocks.append(Block("tetra", indices + offset))
-        name, taken = prim.GetName(), {known for known, _ in prims}
-        prims.append((name if name not in taken else f"{name}_{len(prims) + 1}", len(indices)))
-        for known, nodes in _node_sets(prim, len(points)).items():
-            sets.setdefault(known, []).append(nodes + offset)
-        offset += len(points)
-    return FileMesh(
-        np.concatenate(all_points),
-        blocks,
-        node_sets={known: np.concatenate(parts) for known, parts in sets.items()},
-        metres=metres_per_unit(stage, path),
-        up_axis=str(UsdGeom.GetStageUpAxis(stage)),
-        objects=prims if len(prims) > 1 else [],
-    )
+        name, taken = prim.GetName(), {known for known, _ in parts}
+        name = name if name not in taken else f"{name}_{len(parts) + 1}"
+        sets = _node_sets(prim, len(points))
+        parts.append((name, FileMesh(in_world(prim, points), [Block("tetra", indices)], node_sets=sets)))
+    about = {"metres": metres_per_unit(stage, path), "up_axis": str(UsdGeom.GetStageUpAxis(stage))}
+    return joined_meshes(parts, **about, **({} if len(parts) > 1 else {"objects": []}))
 
 
 def _node_sets(prim: Any, count: int) -> dict[str, NDArray[np.int64]]:
@@ -284,8 +272,10 @@ def has_looks(path: str | PathLike[str]) -> bool:
 
 def look_of_triangles(path: str | PathLike[str], points: NDArray[Any], triangles: NDArray[Any]) -> Look:
     """The triangles of a file as a prim with the file's name."""
-    source = Path(path)
-    (look,) = looks_of(stage_of_triangles(source.stem, points, triangles), source, 1.0)
+    from trimesh import Trimesh
+
+    source, geometry = Path(path), Trimesh(points, triangles, process=False)
+    (look,) = looks_of(_stage_of([(geometry, np.eye(4), source.stem)], source), source, 1.0)
     return look
 
 
@@ -295,16 +285,23 @@ def read_looks(path: str | PathLike[str]) -> list[Look]:
     Raises:
         InputError: The file does not exist, is not a USD stage or another surface file, is damaged, or has no faces.
     """
-    source = Path(path)
-    if source.suffix.lower() not in (*USD_SUFFIXES, *UP_AXES):
+    source, metres = Path(path), 1.0
+    if not has_looks(source):
         known = ", ".join((*USD_SUFFIXES, *UP_AXES))
         raise InputError(f"{source}: extension {source.suffix or '(none)'}; it must be {known}")
     if not source.is_file():
         raise InputError(f"{source}: no such file")
     if source.suffix.lower() in UP_AXES:
-        stage, metres = stage_of_file(source), 1.0
+        parts = placed_meshes(source, maintain_order=True)
+        stage = _stage_of([(mesh, matrix, name or source.stem) for mesh, matrix, _, name in parts], source)
     else:
-        stage = _flattened(open_stage(source))
+        # One layer, without instances.
+        stage = open_stage(source)
+        stage.SetEditTarget(stage.GetSessionLayer())
+        while instances := [prim for prim in stage.Traverse() if prim.IsInstance()]:
+            for prim in instances:
+                prim.SetInstanceable(False)
+        stage = Usd.Stage.Open(stage.Flatten())
         metres = metres_per_unit(stage, source)
     looks = list(looks_of(stage, source, metres))
     if not looks:
@@ -327,6 +324,13 @@ def looks_of(stage: Any, source: Path, metres: float) -> Iterator[Look]:
             continue
         left_handed = mesh.GetOrientationAttr().Get() == UsdGeom.Tokens.leftHanded
         left_handed ^= bool(np.linalg.det(world_matrix(prim)[:3, :3]) < 0.0)
+        with_subsets = [prim, *(child for child in prim.GetChildren() if child.IsA(UsdGeom.Subset))]
+        is_bound = any(
+            UsdShade.MaterialBindingAPI(part).ComputeBoundMaterial(purpose)[0]
+            for part in with_subsets
+            for purpose in PURPOSES
+        )
+        is_colored = mesh.GetDisplayColorAttr().HasAuthoredValue() and not prim.HasAttribute(STRESS)
         normals = mesh.GetNormalsAttr().HasAuthoredValue() or prim.GetAttribute("primvars:normals").HasValue()
         yield Look(
             prim.GetName(),
@@ -339,27 +343,9 @@ def looks_of(stage: Any, source: Path, metres: float) -> Iterator[Look]:
             False,
             bool(normals),
             mesh.GetSubdivisionSchemeAttr().Get() != UsdGeom.Tokens.none,
-            _is_plain(prim),
+            not is_bound and not is_colored,
             stage,
         )
-
-
-def _is_plain(prim: Any) -> bool:
-    parts = [prim, *(child for child in prim.GetChildren() if child.IsA(UsdGeom.Subset))]
-    bound = any(
-        UsdShade.MaterialBindingAPI(part).ComputeBoundMaterial(purpose)[0] for part in parts for purpose in PURPOSES
-    )
-    own_colors = UsdGeom.Mesh(prim).GetDisplayColorAttr().HasAuthoredValue() and not prim.HasAttribute(STRESS)
-    return not bound and not own_colors
-
-
-def _flattened(stage: Any) -> Any:
-    """The stage as one layer, without instances."""
-    stage.SetEditTarget(stage.GetSessionLayer())
-    while instances := [prim for prim in stage.Traverse() if prim.IsInstance()]:
-        for prim in instances:
-            prim.SetInstanceable(False)
-    return Usd.Stage.Open(stage.Flatten())
 
 
 def _without_stale(spec: Any) -> None:
@@ -382,71 +368,43 @@ def _without_stale(spec: Any) -> None:
 ROOT = "/scene"
 
 
-def stage_of_file(path: Path) -> Any:
-    """A stage, in metres, of the file's parts, placed by its scene, in the file's coordinates.
+def _stage_of(parts: Sequence[tuple[Any, np.ndarray, str]], source: Path) -> Any:
+    """A stage, in metres, of parts of a file: meshes of trimesh, their places in the scene [4, 4], and their names.
 
     Parts keep their names, texture coordinates (``st``) and colours; a part with a colour or with a texture in a
     separate file is bound to a `UsdPreviewSurface`.
-
-    Raises:
-        InputError: trimesh cannot read it.
     """
-    stage = Usd.Stage.CreateInMemory()
+    stage, taken = Usd.Stage.CreateInMemory(), set[str]()
     UsdGeom.SetStageMetersPerUnit(stage, 1.0)
     UsdGeom.Scope.Define(stage, ROOT)
-    taken: set[str] = set()
-    for geometry, matrix, _, name in placed_meshes(path, maintain_order=True):
+    for geometry, matrix, name in parts:
         if len(geometry.faces):
-            _define(stage, _free_name(name or path.stem, taken), geometry, matrix, path)
+            stem = Path(name).stem if Path(name).suffix.lower() in (".obj", ".stl", ".ply", ".off") else name
+            _define(stage, free_name(Tf.MakeValidIdentifier(stem), taken), geometry, matrix, source)
     return stage
-
-
-def stage_of_triangles(name: str, points: np.ndarray, triangles: np.ndarray) -> Any:
-    """A stage in metres with one Mesh prim."""
-    stage = Usd.Stage.CreateInMemory()
-    UsdGeom.SetStageMetersPerUnit(stage, 1.0)
-    mesh = UsdGeom.Mesh.Define(stage, f"{ROOT}/{Tf.MakeValidIdentifier(name)}")
-    _set_triangles(mesh, np.asarray(points), np.asarray(triangles))
-    mesh.CreateNormalsAttr(Vt.Vec3fArray(len(points)))
-    mesh.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
-    return stage
-
-
-def _set_triangles(mesh: Any, points: np.ndarray, triangles: np.ndarray) -> None:
-    mesh.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(points, np.float32)))
-    mesh.CreateFaceVertexCountsAttr(Vt.IntArray(len(triangles), 3))
-    mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(np.ascontiguousarray(triangles, np.int32).ravel()))
-    mesh.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
-
-
-def _free_name(name: str, taken: set[str]) -> str:
-    stem = Path(name).stem if Path(name).suffix.lower() in (".obj", ".stl", ".ply", ".off") else name
-    return free_name(Tf.MakeValidIdentifier(stem), taken)
 
 
 def _define(stage: Any, name: str, geometry: Any, matrix: np.ndarray, source: Path) -> None:
     mesh = UsdGeom.Mesh.Define(stage, f"{ROOT}/{name}")
     points = np.asarray(geometry.vertices, np.float64) @ matrix[:3, :3].T + matrix[:3, 3]
-    faces = np.asarray(geometry.faces, np.int32)
-    if np.linalg.det(matrix[:3, :3]) < 0:
-        faces = faces[:, ::-1]
-    _set_triangles(mesh, points, faces)
+    faces = np.asarray(geometry.faces, np.int32)[:, :: -1 if np.linalg.det(matrix[:3, :3]) < 0 else 1]
+    mesh.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(points, np.float32)))
+    mesh.CreateFaceVertexCountsAttr(Vt.IntArray(len(faces), 3))
+    mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(np.ascontiguousarray(faces).ravel()))
+    mesh.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
     normals = np.asarray(geometry.vertex_normals, np.float32) @ np.linalg.inv(matrix[:3, :3]).astype(np.float32)
     mesh.CreateNormalsAttr(Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(normals, np.float32)))
     mesh.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
-    visual, primvars = geometry.visual, UsdGeom.PrimvarsAPI(mesh)
-    uv = getattr(visual, "uv", None)
+    visual, uv = geometry.visual, getattr(geometry.visual, "uv", None)
     if uv is not None and len(uv) == len(points):
         kind = Sdf.ValueTypeNames.TexCoord2fArray
-        st = primvars.CreatePrimvar("st", kind, UsdGeom.Tokens.vertex)
+        st = UsdGeom.PrimvarsAPI(mesh).CreatePrimvar("st", kind, UsdGeom.Tokens.vertex)
         st.Set(Vt.Vec2fArray.FromNumpy(np.asarray(uv, np.float32)))
-    if visual.kind == "vertex":
-        colors = np.asarray(visual.vertex_colors[:, :3], np.float32) / 255.0
-        primvar = mesh.CreateDisplayColorPrimvar(UsdGeom.Tokens.vertex)
-        primvar.Set(Vt.Vec3fArray.FromNumpy(_linear(colors)))
-    elif visual.kind == "face":
-        colors = np.asarray(visual.face_colors[:, :3], np.float32) / 255.0
-        mesh.CreateDisplayColorPrimvar(UsdGeom.Tokens.uniform).Set(Vt.Vec3fArray.FromNumpy(_linear(colors)))
+    if visual.kind in ("vertex", "face"):
+        of_points = visual.kind == "vertex"
+        given = visual.vertex_colors if of_points else visual.face_colors
+        color = mesh.CreateDisplayColorPrimvar(UsdGeom.Tokens.vertex if of_points else UsdGeom.Tokens.uniform)
+        color.Set(Vt.Vec3fArray.FromNumpy(_linear(np.asarray(given[:, :3], np.float32) / 255.0)))
     elif visual.kind == "texture" and visual.defined and visual.material is not None:
         _bind_material(stage, mesh, visual.material, source)
 
@@ -455,25 +413,8 @@ def _bind_material(stage: Any, mesh: Any, material: Any, source: Path) -> None:
     name = Tf.MakeValidIdentifier(getattr(material, "name", None) or f"{mesh.GetPrim().GetName()}_material")
     path = f"{ROOT}/materials/{name}"
     if not stage.GetPrimAtPath(path):
-        bound = UsdShade.Material.Define(stage, path)
-        shader = UsdShade.Shader.Define(stage, f"{path}/surface")
-        shader.CreateIdAttr("UsdPreviewSurface")
-        color = np.asarray(material.main_color, np.float32)[:3] / 255.0
-        diffuse = shader.CreateInput("diffuseColor", Sdf.ValueTypeNames.Color3f)
-        diffuse.Set(Gf.Vec3f(*map(float, _linear(color))))
-        texture = _texture_file(material, source)
-        if texture is not None:
-            reader = UsdShade.Shader.Define(stage, f"{path}/st")
-            reader.CreateIdAttr("UsdPrimvarReader_float2")
-            reader.CreateInput("varname", Sdf.ValueTypeNames.String).Set("st")
-            image = UsdShade.Shader.Define(stage, f"{path}/texture")
-            image.CreateIdAttr("UsdUVTexture")
-            image.CreateInput("file", Sdf.ValueTypeNames.Asset).Set(Sdf.AssetPath(str(texture)))
-            image.CreateInput("st", Sdf.ValueTypeNames.Float2).ConnectToSource(
-                reader.CreateOutput("result", Sdf.ValueTypeNames.Float2)
-            )
-            diffuse.ConnectToSource(image.CreateOutput("rgb", Sdf.ValueTypeNames.Float3))
-        bound.CreateSurfaceOutput().ConnectToSource(shader.CreateOutput("surface", Sdf.ValueTypeNames.Token))
+        color = _linear(np.asarray(material.main_color, np.float32)[:3] / 255.0)
+        preview_material(stage, path, color, texture=_texture_file(material, source))
     UsdShade.MaterialBindingAPI.Apply(mesh.GetPrim()).Bind(UsdShade.Material.Get(stage, path))
 
 

@@ -50,7 +50,13 @@ def material_said(prim: Any) -> dict[str, float]:
             found["friction"] = friction
         if density is not None and density > 0.0:
             found["density"] = density
-    body = _deformable_body(prim)
+    body = prim
+    while body and not body.IsPseudoRoot():
+        listed = body.GetMetadata("apiSchemas")  # includes schemas that OpenUSD does not know
+        if _BODY in body.GetAppliedSchemas() or (listed and _BODY in listed.GetAddedOrExplicitItems()):
+            break
+        body = body.GetParent()
+    body = None if not body or body.IsPseudoRoot() else body
     weights = [_number(body, name) for name in ("density", "mass")] if body else []
     if any(value is not None and value > 0.0 for value in weights) or _value(prim, "masses") is not None:
         found["density"] = math.inf
@@ -79,23 +85,6 @@ def settle_gravity(stage: Any, source: Path) -> list[str]:
         if magnitude is not None and magnitude < 0.0:
             scene.GetGravityMagnitudeAttr().Set(EARTH / UsdGeom.GetStageMetersPerUnit(stage))
     return [str(prim.GetPath()) for prim in scenes]
-
-
-def is_physical(prim: Any) -> bool:
-    """Whether a prim, or something under it, is simulated or collides."""
-    return any(
-        one.IsA(UsdGeom.TetMesh) or one.HasAPI(UsdPhysics.RigidBodyAPI) or one.HasAPI(UsdPhysics.CollisionAPI)
-        for one in Usd.PrimRange(prim, Usd.TraverseInstanceProxies())
-    )
-
-
-def _deformable_body(prim: Any) -> Any:
-    while prim and not prim.IsPseudoRoot():
-        listed = prim.GetMetadata("apiSchemas")  # includes schemas that OpenUSD does not know
-        if _BODY in prim.GetAppliedSchemas() or (listed and _BODY in listed.GetAddedOrExplicitItems()):
-            return prim
-        prim = prim.GetParent()
-    return None
 
 
 def _value(prim: Any, name: str) -> Any:
@@ -273,10 +262,12 @@ def _scene_of(source: Path) -> Scene:
     scene.animated, scene.stopped = _stop_animation(stage)
     scene.physics_scenes = settle_gravity(stage, source)
     for prim in stage.Traverse():
-        if prim.IsA(UsdGeom.TetMesh) and _is_pattern(prim):
-            scene.skipped.append(str(prim.GetPath()))
-        elif prim.IsA(UsdGeom.TetMesh):
-            scene.tets.append(_tet_prim(prim, source))
+        if prim.IsA(UsdGeom.TetMesh):
+            above = [stage.GetPrimAtPath(path) for path in prim.GetPath().GetPrefixes()]
+            if any(each.IsA(UsdGeom.PointInstancer) for each in above):
+                scene.skipped.append(str(prim.GetPath()))
+            else:
+                scene.tets.append(_tet_prim(prim, source))
     if not scene.tets and scene.skipped:
         raise InputError(f"{source}: its only TetMesh prims are prototypes of a point instancer: {scene.skipped[0]}")
     if not scene.tets:
@@ -290,23 +281,17 @@ def _scene_of(source: Path) -> Scene:
 def _without_instances(stage: Any) -> list[str]:
     """Break up the instances that contain prims that can move by themselves; an instance can only move as a whole."""
     opened: list[str] = []
-    while moving := [prim for prim in stage.Traverse(Usd.TraverseInstanceProxies()) if _moves_in_instance(prim)]:
+    while moving := [
+        prim
+        for prim in stage.Traverse(Usd.TraverseInstanceProxies())
+        if prim.IsInstanceProxy() and (prim.IsA(UsdGeom.TetMesh) or prim.HasAPI(UsdPhysics.RigidBodyAPI))
+    ]:
         instance = moving[0]
         while not instance.IsInstance() or instance.IsInstanceProxy():
             instance = instance.GetParent()
         opened.append(str(instance.GetPath()))
         instance.SetInstanceable(False)
     return opened
-
-
-def _moves_in_instance(prim: Any) -> bool:
-    return prim.IsInstanceProxy() and (prim.IsA(UsdGeom.TetMesh) or prim.HasAPI(UsdPhysics.RigidBodyAPI))
-
-
-def _is_pattern(prim: Any) -> bool:
-    while prim and not prim.IsA(UsdGeom.PointInstancer):
-        prim = prim.GetParent()
-    return bool(prim)
 
 
 def _stop_animation(stage: Any) -> tuple[list[str], list[str]]:
@@ -325,7 +310,9 @@ def _stop_animation(stage: Any) -> tuple[list[str], list[str]]:
         if prim.IsA(UsdGeom.TetMesh):
             attributes += [UsdGeom.TetMesh(prim).GetPointsAttr(), UsdGeom.TetMesh(prim).GetTetVertexIndicesAttr()]
             moves = any(attribute.ValueMightBeTimeVarying() for attribute in attributes)
-        if moves and is_physical(prim):
+        physical = (UsdPhysics.RigidBodyAPI, UsdPhysics.CollisionAPI)
+        below = Usd.PrimRange(prim, Usd.TraverseInstanceProxies()) if moves else ()
+        if any(each.IsA(UsdGeom.TetMesh) or any(map(each.HasAPI, physical)) for each in below):
             stopped.append(str(prim.GetPath()))
         if prim.IsA(UsdGeom.Mesh):
             attributes += [prim.GetAttribute(name) for name in ("points", "faceVertexCounts", "faceVertexIndices")]
@@ -354,19 +341,7 @@ def _tet_prim(prim: Any, source: Path) -> TetPrim:
     flat = np.flatnonzero(np.abs(volumes) <= 1e-12 * size**3 / len(tets))
     if len(flat):
         raise InputError(f"{name}: {len(flat)} of {len(tets)} tetrahedra have no volume, the first is {flat[0]}")
-    _check_in_world(prim, points, tets, name)
-    wrong = volumes < 0.0
-    if wrong.any():
-        tets[wrong] = tets[wrong][:, [0, 1, 3, 2]]
-        try:
-            mesh.GetTetVertexIndicesAttr().Set(tets.tolist())
-        except Tf.ErrorException as error:
-            raise InputError(f"{name}: its tetrahedra cannot be turned round: {error}") from None
-    return TetPrim(str(prim.GetPath()), points, tets, int(wrong.sum()), left_handed)
-
-
-def _check_in_world(prim: Any, points: NDArray[np.float64], tets: NDArray[np.int32], name: str) -> None:
-    """Refuse tetrahedra that lose their volume in world coordinates, where positions are float32."""
+    # In world coordinates positions are float32.
     matrix = world_matrix(prim, Usd.TimeCode.Default())
     there = (points @ matrix[:3, :3] + matrix[3, :3]).astype(np.float32).astype(np.float64)
     before, after = signed_volumes(points, tets), signed_volumes(there, tets)
@@ -376,3 +351,11 @@ def _check_in_world(prim: Any, points: NDArray[np.float64], tets: NDArray[np.int
             f"{name}: {gone} of {len(tets)} tetrahedra have too little volume for float32 where they are in the world: "
             "a scale of zero, or too far from the origin"
         )
+    wrong = volumes < 0.0
+    if wrong.any():
+        tets[wrong] = tets[wrong][:, [0, 1, 3, 2]]
+        try:
+            mesh.GetTetVertexIndicesAttr().Set(tets.tolist())
+        except Tf.ErrorException as error:
+            raise InputError(f"{name}: its tetrahedra cannot be turned round: {error}") from None
+    return TetPrim(str(prim.GetPath()), points, tets, int(wrong.sum()), left_handed)

@@ -12,14 +12,14 @@ from numpy.typing import NDArray
 from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdShade, Vt
 
 from warp_corot.errors import InputError
-from warp_corot.io.files.usd import reason, usd_name
+from warp_corot.io.files.usd import preview_material, reason, usd_name
 from warp_corot.io.files.whole import written_whole
 from warp_corot.io.pictures.colors import VertexAverage, color_index
 from warp_corot.io.read.usd.scene import Scene, TetPrim
 from warp_corot.mesh.topology import boundary_faces
 
 from .pieces import ColoredStage, Samples
-from .prims import declare_moving, declare_tet_stress, drawn_material, extent
+from .prims import ROUGHNESS, declare_colors, declare_tet_stress, extent
 
 # --- the moving prims ------------------------------------------------------------------------------------------------
 
@@ -53,7 +53,8 @@ class TetsOver(PointsOver):
         mesh.CreateVelocitiesAttr()
         declare_tet_stress(mesh)
         self._colored = show_stress or not scene.has(prim.path, "primvars:displayColor")
-        declare_moving(mesh, True, colored=self._colored)
+        if self._colored:
+            declare_colors(mesh, with_stress=True)
         if prim.repaired:
             mesh.CreateTetVertexIndicesAttr(Vt.Vec4iArray.FromNumpy(prim.tets))
         if prim.repaired or not scene.has(prim.path, "surfaceFaceVertexIndices"):
@@ -98,17 +99,6 @@ class BodyOver:
 
 def _is_below(path: str, moving: set[str]) -> bool:
     return any(str(above) in moving for above in Sdf.Path(path).GetPrefixes())
-
-
-def draw_ground(stage: Usd.Stage, corners: NDArray[np.float64]) -> None:
-    mesh = UsdGeom.Mesh.Define(stage, _GROUND)
-    mesh.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(corners.astype(np.float32)))
-    mesh.CreateFaceVertexCountsAttr([4])
-    mesh.CreateFaceVertexIndicesAttr([0, 1, 2, 3])
-    mesh.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
-    mesh.CreateDoubleSidedAttr(True)
-    mesh.CreateExtentAttr(extent(corners.astype(np.float32)))
-    mesh.CreateDisplayColorAttr([(0.3, 0.3, 0.3)])
 
 
 # --- the stage -------------------------------------------------------------------------------------------------------
@@ -187,13 +177,28 @@ class SceneWriter(ColoredStage):
         flatten: bool = False,
     ):
         super().__init__(path)
-        self._below = _way(self.path, scene.path.resolve())
+        below = scene.path.resolve()
+        try:  # relative to this layer's folder, so that both can be moved together
+            relative = Path(os.path.relpath(below, self.path.parent.resolve())).as_posix()
+            self._below = relative if relative.startswith("../") else f"./{relative}"
+        except ValueError:  # another drive
+            self._below = usd_name(below)
         if self.path.exists() and self.path.samefile(scene.path):
             raise InputError(f"{self.path}: is the input; it must be another file")
         if scene.uses(self.path):
             raise InputError(f"{self.path}: is part of the input {scene.path}; it must be another file")
         self._scene, self._flatten = scene, flatten
-        self._layer = _base_layer(scene, fps)
+        self._layer = layer = Sdf.Layer.CreateAnonymous(".usdc")
+        source = scene.stage.GetRootLayer()
+        for key in source.pseudoRoot.ListInfoKeys():
+            if key not in _OWN:
+                layer.pseudoRoot.SetInfo(key, source.pseudoRoot.GetInfo(key))
+        layer.timeCodesPerSecond = layer.framesPerSecond = fps
+        first = scene.stage.GetDefaultPrim() or scene.stage.GetPrimAtPath(scene.tets[0].path)
+        layer.defaultPrim = first.GetPath().GetPrefixes()[0].name
+        Sdf.CreatePrimInLayer(layer, f"/{layer.defaultPrim}")
+        for name in scene.uninstanced:
+            Sdf.CreatePrimInLayer(layer, name).SetInfo("instanceable", False)
         stage, moving = Usd.Stage.Open(self._layer), {*bodies, *scene.animated}
         self._soft = [TetsOver(stage, scene, prim, moving, show_stress) for prim in tets]
         self._bodies = [BodyOver(stage, scene, name, pose, moving) for name, pose in bodies.items()]
@@ -203,9 +208,16 @@ class SceneWriter(ColoredStage):
                 if scene.has(surface.path, name):
                     surface.prim.CreateAttribute(name, Sdf.ValueTypeNames.Normal3fArray, custom=False).Block()
         if ground is not None:
-            draw_ground(stage, ground)
+            plane = UsdGeom.Mesh.Define(stage, _GROUND)
+            plane.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(ground.astype(np.float32)))
+            plane.CreateFaceVertexCountsAttr([4])
+            plane.CreateFaceVertexIndicesAttr([0, 1, 2, 3])
+            plane.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
+            plane.CreateDoubleSidedAttr(True)
+            plane.CreateExtentAttr(extent(ground.astype(np.float32)))
+            plane.CreateDisplayColorAttr([(0.3, 0.3, 0.3)])
         if show_stress:
-            material = drawn_material(stage, _LOOK)
+            material = preview_material(stage, _LOOK, roughness=ROUGHNESS)
             for soft in self._soft:
                 # Not the binding for all purposes, which may define the physics.
                 for purpose in (UsdShade.Tokens.full, UsdShade.Tokens.preview):
@@ -219,8 +231,6 @@ class SceneWriter(ColoredStage):
             OSError: It could not be written, for example because the disk is full; former frames stay and play.
         """
         self._check_open()
-        if not self.frames:
-            self.declare(self._layer)
         samples: Samples = {}
         for index, soft in enumerate(self._soft):
             samples |= soft.samples(state.positions[index], state.velocities[index], state.von_mises[index])
@@ -228,7 +238,7 @@ class SceneWriter(ColoredStage):
             samples |= body.samples(pose)
         for surface, points in zip(self._surfaces, state.surfaces, strict=True):
             samples |= surface.samples(points)
-        self._add(samples, np.concatenate(state.von_mises))
+        self._add(self._layer, samples, np.concatenate(state.von_mises))
 
     def close(self) -> None:
         """Join all frames into one file; further calls do nothing.
@@ -241,7 +251,11 @@ class SceneWriter(ColoredStage):
             self._static.subLayerPaths = [self._below]
         super().close()
         if was_open and self._flatten and self.frames:
-            _flatten(self.path)
+            try:
+                with written_whole(self.path) as part:
+                    Usd.Stage.Open(usd_name(self.path)).Flatten().Export(usd_name(part))
+            except Tf.ErrorException as error:
+                raise OSError(f"{self.path}: cannot be flattened: {reason(error)}") from None
 
     def _root_layer(self, pieces: list[tuple[float, float]]) -> Sdf.Layer:
         root = super()._root_layer(pieces)
@@ -253,35 +267,3 @@ class SceneWriter(ColoredStage):
         for soft in self._soft:
             colors |= soft.colors(samples, self.stress_range[1])
         return colors
-
-
-def _base_layer(scene: Scene, fps: float) -> Sdf.Layer:
-    layer = Sdf.Layer.CreateAnonymous(".usdc")
-    source = scene.stage.GetRootLayer()
-    for key in source.pseudoRoot.ListInfoKeys():
-        if key not in _OWN:
-            layer.pseudoRoot.SetInfo(key, source.pseudoRoot.GetInfo(key))
-    layer.timeCodesPerSecond = layer.framesPerSecond = fps
-    first = scene.stage.GetDefaultPrim() or scene.stage.GetPrimAtPath(scene.tets[0].path)
-    layer.defaultPrim = first.GetPath().GetPrefixes()[0].name
-    Sdf.CreatePrimInLayer(layer, f"/{layer.defaultPrim}")
-    for path in scene.uninstanced:
-        Sdf.CreatePrimInLayer(layer, path).SetInfo("instanceable", False)
-    return layer
-
-
-def _way(path: Path, below: Path) -> str:
-    """The path of the layer below: relative to this layer's folder, so that both can be moved together."""
-    try:
-        found = Path(os.path.relpath(below, path.parent.resolve())).as_posix()
-    except ValueError:  # another drive
-        return usd_name(below)
-    return found if found.startswith("../") else f"./{found}"
-
-
-def _flatten(path: Path) -> None:
-    try:
-        with written_whole(path) as part:
-            Usd.Stage.Open(usd_name(path)).Flatten().Export(usd_name(part))
-    except Tf.ErrorException as error:
-        raise OSError(f"{path}: cannot be flattened: {reason(error)}") from None

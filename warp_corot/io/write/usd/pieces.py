@@ -26,11 +26,11 @@ from typing import IO, Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pxr import Sdf, Tf, Vt
+from pxr import Sdf, Tf, Usd, Vt
 
 from warp_corot.errors import InputError
-from warp_corot.io.files.usd import check_stage_path, is_locked, reason, take_lock, usd_name
-from warp_corot.io.files.whole import WriteError, sync, writing
+from warp_corot.io.files.usd import STAGE_SUFFIXES, is_locked, reason, take_lock, usd_name
+from warp_corot.io.files.whole import WriteError, check_output, sync, writing
 from warp_corot.io.pictures.colors import COLORMAP_NAME, round_limit
 from warp_corot.simulation.progress import bar_of
 
@@ -38,8 +38,18 @@ from warp_corot.simulation.progress import bar_of
 _OURS = re.compile(r"(piece-\d{6}|static|manifest)\.usd[ac]|part[-\w]*\.\w{3,6}|lock")
 #: How long before a frame [time codes] values that must not be interpolated are repeated.
 JUST_BEFORE = 2.0**-10
+#: Values that take memory.
+ARRAYS = (Vt.IntArray, Vt.FloatArray, Vt.Vec3fArray, Vt.Vec3iArray, Vt.Vec4iArray)
 Samples = dict[str, Any]
 """Values of one frame: attribute path → value."""
+
+
+def declare(stage: Usd.Stage, values: Samples) -> None:
+    """Declare attributes without values; those that their prims' schemas do not have are declared already."""
+    for path in map(Sdf.Path, values):
+        prim = stage.GetPrimAtPath(path.GetPrimPath())
+        if not (attribute := prim.GetAttribute(path.name)).IsAuthored():
+            prim.CreateAttribute(path.name, attribute.GetTypeName(), custom=False)
 
 
 class PieceStore:
@@ -62,7 +72,8 @@ class PieceStore:
 
     def __init__(self, path: str | Path, *, flush_seconds: float = 2.0, flush_bytes: int = 256 << 20):
         self.path = Path(path)
-        check_stage_path(self.path)
+        usd_name(self.path)
+        check_output(self.path, STAGE_SUFFIXES)
         self.pieces_folder = self.path.with_name(self.path.name + ".pieces")
         self._run = self.pieces_folder / f"run-{uuid.uuid4().hex[:8]}"
         self._reserve = self._run / "part-reserve.bin"
@@ -121,7 +132,7 @@ class PieceStore:
         if held:
             self._pending.append((time_code - JUST_BEFORE, held))
         self._pending.append((time_code, samples))
-        self._pending_bytes += sum(map(_nbytes, samples.values()))
+        self._pending_bytes += sum(memoryview(value).nbytes for value in samples.values() if isinstance(value, ARRAYS))
         self._last |= samples
         gap, self._last_add = now - self._last_add, now
         interval = max(self._flush_seconds, 4.0 * self._flush_cost)
@@ -149,7 +160,11 @@ class PieceStore:
                 with contextlib.suppress(OSError):
                     self._write_piece()
             raise OSError(f"{error}; {self._kept()}") from None
-        self._keep_room()
+        # Reserve as much of the disk as the last piece takes twice: where it fills, that is room for waiting frames.
+        wanted = 2 * (self._run / f"piece-{len(self._pieces) - 1:06d}.usdc").stat().st_size
+        with contextlib.suppress(OSError, AttributeError), self._reserve.open("ab") as file:
+            if file.tell() < wanted:
+                os.posix_fallocate(file.fileno(), 0, wanted)
         self._last_flush = time.monotonic()
         self._flush_cost = self._last_flush - started
 
@@ -193,14 +208,6 @@ class PieceStore:
     def last_look(self, samples: Samples) -> Samples:
         """The values of a frame that change at the end."""
         return {}
-
-    def _keep_room(self) -> None:
-        """Reserve as much of the disk as the last piece takes twice: where it fills, that is room for the frames that
-        wait."""
-        wanted = 2 * (self._run / f"piece-{len(self._pieces) - 1:06d}.usdc").stat().st_size
-        with contextlib.suppress(OSError, AttributeError), self._reserve.open("ab") as file:
-            if file.tell() < wanted:
-                os.posix_fallocate(file.fileno(), 0, wanted)
 
     # --- layers ------------------------------------------------------------------------------------------------------
 
@@ -427,8 +434,9 @@ class ColoredStage(PieceStore):
         if self._closed:
             raise InputError(f"{self.path}: is closed; frames must be added before")
 
-    def _add(self, samples: Samples, stress: NDArray[np.float32] | None) -> None:
-        """Add a frame with stresses of tetrahedra [T] [Pa], if any."""
+    def _add(self, layer: Sdf.Layer, samples: Samples, stress: NDArray[np.float32] | None, **follows: Any) -> None:
+        """Add a frame with stresses of tetrahedra [T] [Pa], if any; the first one declares its attributes in the layer
+        with what does not change, and ``follows`` is as for `declare`."""
         if stress is not None:
             self.widen_range(self.range_for(stress))
             self._ranges_used.add(self.stress_range)
@@ -436,16 +444,12 @@ class ColoredStage(PieceStore):
             legend = {"map": COLORMAP_NAME, "quantity": "von Mises stress", "unit": "Pa"}
             self.custom_data["stressColors"] = legend | {"lowest": lowest, "highest": highest}
             samples |= self._colors(samples)
+        if not self.frames:
+            declare(Usd.Stage.Open(layer), samples)
+            self.declare(layer, **follows)
         self.add(float(self.frames), samples)
         self.frames += 1
 
     def _colors(self, samples: Samples) -> Samples:
         """Colours for the stresses of a frame, in the present range."""
         raise NotImplementedError
-
-
-def _nbytes(value: Any) -> int:
-    try:
-        return memoryview(value).nbytes
-    except TypeError:  # a quaternion or a matrix
-        return 128

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -11,13 +10,13 @@ from numpy.typing import NDArray
 from pxr import Gf, Sdf, Tf, UsdGeom, UsdShade, Vt
 
 from warp_corot.errors import InputError
-from warp_corot.io.files.usd import free_name
+from warp_corot.io.files.usd import free_name, preview_material
 from warp_corot.io.pictures.colors import TISSUE, VertexAverage, color_index, srgb_to_linear, stress_colors
 from warp_corot.io.write.skins import Skin
 from warp_corot.mesh.surfaces.bound import vertex_normals
 from warp_corot.mesh.topology import boundary_faces
 
-from .pieces import Samples
+from .pieces import Samples, declare
 
 # --- contact as primvars: the force on each node, and the pressure ---------------------------------------------------
 
@@ -40,14 +39,18 @@ class Touched(NamedTuple):
         }
 
 
-def declare_touched(prim: Any, *, forces: bool = True) -> None:
-    """Declare the primvars, without values."""
-    primvars, types, vertex = UsdGeom.PrimvarsAPI(prim), Sdf.ValueTypeNames, UsdGeom.Tokens.vertex
-    if forces:
-        force = primvars.CreatePrimvar(FORCE, types.Vector3fArray, vertex)
-        force.GetAttr().SetDocumentation("Contact force on each node in the last step [N]")
-    pressure = primvars.CreatePrimvar(PRESSURE, types.FloatArray, vertex)
-    pressure.GetAttr().SetDocumentation("Contact pressure in the last step, averaged over the triangles around [Pa]")
+def declare_primvar(prim: Any, name: str, kind: Any, interpolation: str, said: str = "") -> Any:
+    """Declare a primvar without values; ``said`` is its documentation."""
+    primvar = UsdGeom.PrimvarsAPI(prim).CreatePrimvar(name, kind, interpolation)
+    if said:
+        primvar.GetAttr().SetDocumentation(said)
+    return primvar
+
+
+def declare_pressure(prim: Any) -> None:
+    """Declare the pressure of contact at the nodes of a prim."""
+    said = "Contact pressure in the last step, averaged over the triangles around [Pa]"
+    declare_primvar(prim, PRESSURE, Sdf.ValueTypeNames.FloatArray, UsdGeom.Tokens.vertex, said)
 
 
 # --- what all prims share, and surfaces ------------------------------------------------------------------------------
@@ -57,6 +60,8 @@ MATERIALS = "/SoftBody/materials"
 #: The subset of a surface with the faces of cuts, its material, and the colour inside tissue (sRGB).
 CUT = "cut"
 INSIDE = (0.55, 0.12, 0.12)
+#: Of what shows the stress, or has been cut.
+ROUGHNESS = 0.6
 PHYSICS = "/SoftBody/physics"
 OBSTACLES = "/SoftBody/obstacles"
 
@@ -85,16 +90,28 @@ class Present(NamedTuple):
     material: Any
 
 
-@dataclass(frozen=True)
-class Statics:
-    """Properties of all frames: whether they have velocities, stress and contact."""
+class DrawnPrim:
+    """A prim that frames move."""
 
-    velocities: bool
-    stress: bool
-    touched: bool
+    @property
+    def follows(self) -> dict[str, str]:
+        """See `PieceStore.declare`."""
+        return {}
+
+    def define(self, stage: Any, frame: Frame) -> None:
+        """Define the prim with everything that does not change, and the attributes that its schema does not have."""
+        raise NotImplementedError
+
+    def samples(self, frame: Frame) -> Samples:
+        """Values of a frame without colours."""
+        raise NotImplementedError
+
+    def colors(self, samples: Samples, limits: Limits) -> Samples:
+        """Colours for the stresses of a frame."""
+        return {}
 
 
-class SkinPrim:
+class SkinPrim(DrawnPrim):
     """The Mesh prim of a surface that is bound to the body's nodes.
 
     Args:
@@ -131,12 +148,10 @@ class SkinPrim:
 
     @property
     def follows(self) -> dict[str, str]:
-        """See `PieceStore.declare`."""
         own = ("points", "normals", "velocities", "primvars:vonMises", *ATTRIBUTES)
         return {f"{self._path}.{name}": f"{self._path}.faceVertexIndices" for name in own}
 
-    def declare(self, stage: Any, statics: Statics) -> None:
-        """As in `TetPrims.declare`."""
+    def define(self, stage: Any, frame: Frame) -> None:
         look, surface = self._skin.look, self._skin.surface
         if look is not None:
             look.copy_to(stage.GetRootLayer(), self._path, MATERIALS)
@@ -145,26 +160,21 @@ class SkinPrim:
             mesh = UsdGeom.Mesh.Define(stage, self._path)
             declare_triangles(mesh)
             if not self._changing:
-                for path, value in triangle_samples(self._path, surface.triangles).items():
-                    stage.GetAttributeAtPath(path).Set(value)
+                set_values(stage, triangle_samples(self._path, surface.triangles))
         if self._changing and self._skin.is_cut:
-            declare_cut(mesh, self._path, statics.stress)
+            declare_cut(mesh, self._path, frame.stress is not None)
         mesh.GetPrim().SetDisplayName(self._skin.name)
         if self._with_normals:
-            mesh.CreateNormalsAttr()
             mesh.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
-        if statics.velocities:
-            mesh.CreateVelocitiesAttr()
-        if statics.stress:
-            primvars = UsdGeom.PrimvarsAPI(mesh)
-            stress = primvars.CreatePrimvar("vonMises", Sdf.ValueTypeNames.FloatArray, UsdGeom.Tokens.vertex)
-            stress.GetAttr().SetDocumentation("Von Mises stress, averaged over the tetrahedra around [Pa]")
-        if statics.touched:
-            declare_touched(mesh, forces=False)
-        declare_moving(mesh, statics.stress, colored=self._with_colors)
+        if frame.stress is not None:
+            said = "Von Mises stress, averaged over the tetrahedra around [Pa]"
+            declare_primvar(mesh, "vonMises", Sdf.ValueTypeNames.FloatArray, UsdGeom.Tokens.vertex, said)
+        if frame.touched is not None:
+            declare_pressure(mesh)
+        if self._with_colors:
+            declare_colors(mesh, frame.stress is not None)
 
     def samples(self, frame: Frame) -> Samples:
-        """As in `TetPrims.samples`."""
         surface = self._skin.surface
         x = frame.positions[self._nodes] if self._nodes is not None else surface.moved(frame.positions - self._rest)
         x = x.astype(np.float32, copy=False)
@@ -194,7 +204,6 @@ class SkinPrim:
         return samples
 
     def colors(self, samples: Samples, limits: Limits) -> Samples:
-        """As in `TetPrims.colors`."""
         stress = samples.get(f"{self._path}.primvars:vonMises")
         if not self._with_colors or stress is None:
             return {}
@@ -211,9 +220,7 @@ def skin_paths(skins: Sequence[Skin]) -> list[str]:
 
 
 def declare_triangles(mesh: Any) -> None:
-    """Triangles wound counter-clockwise seen from outside, without values."""
-    mesh.CreateFaceVertexCountsAttr()
-    mesh.CreateFaceVertexIndicesAttr()
+    """Triangles wound counter-clockwise seen from outside."""
     mesh.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
     mesh.CreateOrientationAttr(UsdGeom.Tokens.rightHanded)
 
@@ -223,28 +230,17 @@ def declare_cut(mesh: Any, path: str, with_stress: bool) -> None:
     subset = UsdGeom.Subset.Define(mesh.GetPrim().GetStage(), f"{path}/{CUT}")
     subset.CreateElementTypeAttr(UsdGeom.Tokens.face)
     subset.CreateFamilyNameAttr(UsdShade.Tokens.materialBind)
-    subset.CreateIndicesAttr()
     UsdGeom.Subset.SetFamilyType(mesh, UsdShade.Tokens.materialBind, UsdGeom.Tokens.nonOverlapping)
-    material = drawn_material(mesh.GetPrim().GetStage(), f"{MATERIALS}/{CUT}", None if with_stress else INSIDE)
+    color = None if with_stress else srgb_to_linear(INSIDE)
+    material = preview_material(mesh.GetPrim().GetStage(), f"{MATERIALS}/{CUT}", color, roughness=ROUGHNESS)
     UsdShade.MaterialBindingAPI.Apply(subset.GetPrim()).Bind(material)
 
 
-def drawn_material(stage: Any, path: str, color: Sequence[float] | None = None) -> Any:
-    """A preview material of one colour (sRGB), or of the prim's ``displayColor``."""
-    material = UsdShade.Material.Define(stage, path)
-    shader = UsdShade.Shader.Define(stage, f"{path}/surface")
-    shader.CreateIdAttr("UsdPreviewSurface")
-    shader.CreateInput("roughness", Sdf.ValueTypeNames.Float).Set(0.6)
-    diffuse = shader.CreateInput("diffuseColor", Sdf.ValueTypeNames.Color3f)
-    if color is None:
-        reader = UsdShade.Shader.Define(stage, f"{path}/color")
-        reader.CreateIdAttr("UsdPrimvarReader_float3")
-        reader.CreateInput("varname", Sdf.ValueTypeNames.String).Set("displayColor")
-        diffuse.ConnectToSource(reader.ConnectableAPI(), "result")
-    else:
-        diffuse.Set(Gf.Vec3f(*srgb_to_linear(color)))
-    material.CreateSurfaceOutput().ConnectToSource(shader.ConnectableAPI(), "surface")
-    return material
+def set_values(stage: Any, values: Samples) -> None:
+    """Set default values of attributes, which are declared if their schema has them."""
+    declare(stage, values)
+    for path, value in values.items():
+        stage.GetAttributeAtPath(path).Set(value)
 
 
 def triangle_samples(path: str, triangles: NDArray[np.int32]) -> Samples:
@@ -257,20 +253,17 @@ def triangle_samples(path: str, triangles: NDArray[np.int32]) -> Samples:
 
 def declare_tet_stress(tets: Any) -> None:
     """Declare the stress of each tetrahedron of a TetMesh."""
-    kind = Sdf.ValueTypeNames.FloatArray
-    stress = UsdGeom.PrimvarsAPI(tets).CreatePrimvar("vonMises", kind, UsdGeom.Tokens.uniform)
-    stress.GetAttr().SetDocumentation("Von Mises stress of each tetrahedron [Pa]")
+    said = "Von Mises stress of each tetrahedron [Pa]"
+    declare_primvar(tets, "vonMises", Sdf.ValueTypeNames.FloatArray, UsdGeom.Tokens.uniform, said)
 
 
-def declare_moving(body: Any, with_stress: bool, colored: bool = True) -> None:
-    """Declare points, extent and, if it has any, colours: of the stress, or else of tissue."""
-    body.CreatePointsAttr()
-    body.CreateExtentAttr()
-    if colored and with_stress:
+def declare_colors(body: Any, with_stress: bool) -> None:
+    """Declare colours: of the stress, or else of tissue."""
+    if with_stress:
         color = body.CreateDisplayColorPrimvar(UsdGeom.Tokens.vertex)
         color.Set(Vt.Vec3fArray.FromNumpy(srgb_to_linear(stress_colors()).astype(np.float32)))
         color.CreateIndicesAttr()
-    elif colored:
+    else:
         color = body.CreateDisplayColorPrimvar(UsdGeom.Tokens.constant)
         color.Set(Vt.Vec3fArray([Gf.Vec3f(*srgb_to_linear(TISSUE))]))
 
@@ -304,7 +297,7 @@ STRESS = f"{TETS}.primvars:vonMises"
 UNITS = {"young": " [Pa]", "poisson": "", "density": " [kg/m³]"}
 
 
-class TetPrims:
+class TetPrims(DrawnPrim):
     """The TetMesh prim.
 
     Args:
@@ -324,30 +317,35 @@ class TetPrims:
 
     @property
     def follows(self) -> dict[str, str]:
-        """See `PieceStore.declare`."""
         own = ("points", "velocities", *ATTRIBUTES, "primvars:rest", "primvars:vonMises")
         return {f"{TETS}.{name}": INDICES for name in (*own, *(f"primvars:{name}" for name in UNITS))}
 
-    def declare(self, stage: Any, statics: Statics) -> None:
-        """Declare everything that does not change, and the attributes that do, without values."""
+    def define(self, stage: Any, frame: Frame) -> None:
         tets = UsdGeom.TetMesh.Define(stage, TETS)
-        tets.CreateTetVertexIndicesAttr()
-        tets.CreateSurfaceFaceVertexIndicesAttr()
         tets.CreateOrientationAttr(UsdGeom.Tokens.rightHanded)
         # Beside its surface it would be drawn twice, and Hydra takes its uniform primvars for values per face.
         tets.CreatePurposeAttr(UsdGeom.Tokens.guide)
-        if statics.velocities:
-            tets.CreateVelocitiesAttr()
-        self._declare_primvars(UsdGeom.PrimvarsAPI(tets), statics)
-        declare_moving(tets, statics.stress, colored=False)
-        if statics.touched:
-            declare_touched(tets)
+        types, tokens = Sdf.ValueTypeNames, UsdGeom.Tokens
+        declare_primvar(tets, "rest", types.Point3fArray, tokens.vertex)
+        if frame.stress is not None:
+            declare_tet_stress(tets)
+        if self._present.fixed is not None:
+            declare_primvar(tets, "fixed", types.IntArray, tokens.vertex, "1 where the node is held")
+        for name, unit in UNITS.items():
+            value, said = getattr(self._present.material, name, None), f"Material: {name}{unit}"
+            if value is not None and name in self._uniform:
+                primvar = declare_primvar(tets, name, types.Float, tokens.constant, said)
+                primvar.Set(float(np.asarray(value).reshape(())))
+            elif value is not None:
+                declare_primvar(tets, name, types.FloatArray, tokens.uniform, said)
+        if frame.touched is not None:
+            said = "Contact force on each node in the last step [N]"
+            declare_primvar(tets, FORCE, types.Vector3fArray, tokens.vertex, said)
+            declare_pressure(tets)
         if not self._changing:
-            for path, value in self._topology().items():
-                stage.GetAttributeAtPath(path).Set(value)
+            set_values(stage, self._topology())
 
     def samples(self, frame: Frame) -> Samples:
-        """Values of a frame without colours."""
         x, v = frame.positions, frame.velocities
         samples: Samples = {f"{TETS}.points": Vt.Vec3fArray.FromNumpy(x), f"{TETS}.extent": extent(x)}
         if v is not None:
@@ -356,19 +354,12 @@ class TetPrims:
             samples[STRESS] = Vt.FloatArray.FromNumpy(frame.stress)
         if frame.touched is not None:
             samples |= frame.touched.samples(TETS)
-        return samples | self._changes() if self._changing else samples
-
-    def colors(self, samples: Samples, limits: Limits) -> Samples:
-        """Colours for the stresses of a frame: none, as viewers draw the surfaces."""
-        return {}
-
-    def _changes(self) -> Samples:
-        """Changed values among those that do not change in every frame."""
+        if not self._changing:
+            return samples
         before, self._said, now = self._said, self._present, self._present
-        same = before is now or (
-            before is not None and np.array_equal(before.tets, now.tets) and np.array_equal(before.points, now.points)
-        )
-        return {} if same else self._topology()
+        names = ("tets", "points")
+        same = before is not None and all(np.array_equal(getattr(before, name), getattr(now, name)) for name in names)
+        return samples if same else samples | self._topology()
 
     def _topology(self) -> Samples:
         present = self._present
@@ -388,22 +379,3 @@ class TetPrims:
                 values = floats(given, (len(present.tets),), f"material.{name}")
                 samples[f"{TETS}.primvars:{name}"] = Vt.FloatArray.FromNumpy(values)
         return samples
-
-    def _declare_primvars(self, primvars: Any, statics: Statics) -> None:
-        types, tokens = Sdf.ValueTypeNames, UsdGeom.Tokens
-        primvars.CreatePrimvar("rest", types.Point3fArray, tokens.vertex)
-        if statics.stress:
-            declare_tet_stress(primvars)
-        if self._present.fixed is not None:
-            fixed = primvars.CreatePrimvar("fixed", types.IntArray, tokens.vertex)
-            fixed.GetAttr().SetDocumentation("1 where the node is held")
-        for name, unit in UNITS.items():
-            value = getattr(self._present.material, name, None)
-            if value is None:
-                continue
-            if name in self._uniform:
-                primvar = primvars.CreatePrimvar(name, types.Float, tokens.constant)
-                primvar.Set(float(np.asarray(value).reshape(())))
-            else:
-                primvar = primvars.CreatePrimvar(name, types.FloatArray, tokens.uniform)
-            primvar.GetAttr().SetDocumentation(f"Material: {name}{unit}")

@@ -27,15 +27,15 @@ from .prims import (
     ROOT,
     SURFACE,
     TETS,
+    DrawnPrim,
     Frame,
-    Limits,
     Present,
     SkinPrim,
-    Statics,
     TetPrims,
     Touched,
     declare_triangles,
     floats,
+    set_values,
     skin_paths,
     triangle_samples,
 )
@@ -69,7 +69,9 @@ def declare_physics(
     UsdPhysics.SetStageKilogramsPerUnit(stage, 1.0)
     UsdGeom.Scope.Define(stage, PHYSICS)
     if gravity is not None:
-        _declare_scene(stage, gravity)
+        scene, size = UsdPhysics.Scene.Define(stage, f"{PHYSICS}/scene"), float(np.linalg.norm(gravity))
+        scene.CreateGravityMagnitudeAttr(size)
+        scene.CreateGravityDirectionAttr(Gf.Vec3f(*(g / size for g in gravity)) if size else Gf.Vec3f(0.0, 0.0, 0.0))
     body, tets = stage.GetPrimAtPath(ROOT), stage.GetPrimAtPath(TETS)
     if with_tets:
         body.AddAppliedSchema("PhysicsDeformableBodyAPI")
@@ -81,39 +83,24 @@ def declare_physics(
     kinds, of_element = np.unique(np.stack(np.broadcast_arrays(*values)), axis=1, return_inverse=True)
     if kinds.shape[1] > MOST_MATERIALS:
         return
-    made = [_material(stage, number, kind) for number, kind in enumerate(kinds.T.tolist(), start=1)]
-    bound = tets if with_tets else body
-    if len(made) == 1:
-        _bind(bound, made[0])
-    elif with_tets and not changing:
-        for number, material in enumerate(made):
+    for number, kind in enumerate(kinds.T.tolist()):
+        name = f"material{number + 1}"
+        material, bound = UsdShade.Material.Define(stage, f"{PHYSICS}/{name}"), tets if with_tets else body
+        prim = material.GetPrim()
+        UsdPhysics.MaterialAPI.Apply(prim)
+        prim.AddAppliedSchema("PhysicsVolumeDeformableMaterialAPI")
+        for attribute, value in zip(_NAMES, kind, strict=True):
+            prim.CreateAttribute(f"physics:{attribute}", Sdf.ValueTypeNames.Float, custom=False).Set(value)
+        if kinds.shape[1] > 1:
+            if changing or not with_tets:
+                continue
             own = np.flatnonzero(of_element.ravel() == number).astype(np.int32)
-            subset = UsdGeom.Subset.Define(stage, f"{TETS}/{material.GetPrim().GetName()}")
+            subset = UsdGeom.Subset.Define(stage, f"{TETS}/{name}")
             subset.CreateElementTypeAttr(UsdGeom.Tokens.tetrahedron)
             subset.CreateFamilyNameAttr("physics")
             subset.CreateIndicesAttr(Vt.IntArray.FromNumpy(own))
-            _bind(subset.GetPrim(), material)
-
-
-def _declare_scene(stage: Any, gravity: Sequence[float]) -> None:
-    scene = UsdPhysics.Scene.Define(stage, f"{PHYSICS}/scene")
-    size = float(np.linalg.norm(gravity))
-    scene.CreateGravityMagnitudeAttr(size)
-    scene.CreateGravityDirectionAttr(Gf.Vec3f(*(g / size for g in gravity)) if size else Gf.Vec3f(0.0, 0.0, 0.0))
-
-
-def _material(stage: Any, number: int, values: Sequence[float]) -> Any:
-    material = UsdShade.Material.Define(stage, f"{PHYSICS}/material{number}")
-    prim = material.GetPrim()
-    UsdPhysics.MaterialAPI.Apply(prim)
-    prim.AddAppliedSchema("PhysicsVolumeDeformableMaterialAPI")
-    for (name, _), value in zip(_NAMES.items(), values, strict=True):
-        prim.CreateAttribute(f"physics:{name}", Sdf.ValueTypeNames.Float, custom=False).Set(value)
-    return material
-
-
-def _bind(prim: Any, material: Any) -> None:
-    UsdShade.MaterialBindingAPI.Apply(prim).Bind(material, materialPurpose="physics")
+            bound = subset.GetPrim()
+        UsdShade.MaterialBindingAPI.Apply(bound).Bind(material, materialPurpose="physics")
 
 
 # --- rigid obstacles, which move if they are tools -------------------------------------------------------------------
@@ -121,7 +108,7 @@ def _bind(prim: Any, material: Any) -> None:
 FORCE, TORQUE = "contact:force", "contact:torque"
 
 
-class ObstaclePrim:
+class ObstaclePrim(DrawnPrim):
     """The prim of an obstacle: a Sphere, Capsule, Cylinder, Cube or Mesh; for a ground a Plane, as large as the bodies
     on it.
 
@@ -145,13 +132,7 @@ class ObstaclePrim:
             self._place[:3] = corners.mean(axis=0)
             self._width = float(np.linalg.norm(corners[1] - corners[0]))
 
-    @property
-    def follows(self) -> dict[str, str]:
-        """See `PieceStore.declare`."""
-        return {}
-
-    def declare(self, stage: Any, statics: Statics) -> None:
-        """As in `TetPrims.declare`."""
+    def define(self, stage: Any, frame: Frame) -> None:
         shape = shape_of(self._obstacle)
         prim = _gprim(stage, self._path, shape, self._width)
         moves = isinstance(self._obstacle, Tool)
@@ -170,7 +151,6 @@ class ObstaclePrim:
                 attribute.SetDocumentation(f"{said}, of the bodies on the tool, in the world's frame")
 
     def samples(self, frame: Frame) -> Samples:
-        """As in `TetPrims.samples`: the tool's place, and the force and torque on it."""
         if not isinstance(self._obstacle, Tool):
             return {}
         place, turn = _place(self._obstacle.present_pose[self._world])
@@ -181,10 +161,6 @@ class ObstaclePrim:
             f"{self._path}.{FORCE}": Gf.Vec3f(*wrench[:3]),
             f"{self._path}.{TORQUE}": Gf.Vec3f(*wrench[3:]),
         }
-
-    def colors(self, samples: Samples, limits: Limits) -> Samples:
-        """As in `TetPrims.colors`."""
-        return {}
 
 
 def obstacle_prims(obstacles: Sequence[Obstacle], points: NDArray[np.float64], world: int) -> list[ObstaclePrim]:
@@ -219,8 +195,7 @@ def _gprim(stage: Any, path: str, shape: Shape, width: float) -> Any:
         prim = UsdGeom.Mesh.Define(stage, path)
         declare_triangles(prim)
         prim.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(np.asarray(shape.points, dtype=np.float32)))
-        for name, values in triangle_samples(path, shape.triangles).items():
-            stage.GetAttributeAtPath(name).Set(values)
+        set_values(stage, triangle_samples(path, shape.triangles))
     elif isinstance(shape, Box):
         prim = UsdGeom.Cube.Define(stage, path)
         prim.CreateSizeAttr(2.0)
@@ -338,12 +313,12 @@ class UsdWriter(ColoredStage):
         self.about: dict[str, Any] = {}
         self._present = _present(mesh, fixed, material)
         self._tets = TetPrims(self._present, changing=changing) if tets or not skins else None
-        skins = skins or _boundary(self._present)
+        skins = skins or [Skin("surface", boundary_surface(self._present), is_boundary=True)]
         named = zip(skins, skin_paths(skins), strict=True)
         self._skins = [SkinPrim(skin, path, mesh.points, changing=changing) for skin, path in named]
-        self._prims: list[TetPrims | SkinPrim | ObstaclePrim] = [*([self._tets] if self._tets else []), *self._skins]
+        self._prims: list[DrawnPrim] = [*([self._tets] if self._tets else []), *self._skins]
         self._prims += obstacle_prims(obstacles, self._present.points, world)
-        self._given: Statics | None = None
+        self._given: tuple[bool, ...] | None = None
 
     def change_mesh(
         self, mesh: Mesh, *, fixed: ArrayLike | None = None, material: Any = None, skins: Sequence[Skin] = ()
@@ -361,7 +336,7 @@ class UsdWriter(ColoredStage):
         if not self._changing:
             raise InputError(f"{self.path}: the mesh cannot change; the writer must be made with changing=True")
         present = _present(mesh, fixed, material)
-        skins = skins or _boundary(present)
+        skins = skins or [Skin("surface", boundary_surface(present), is_boundary=True)]
         if len(skins) != len(self._skins):
             raise InputError(f"there are {len(skins)} skins now; there must be {len(self._skins)} as before")
         self._present = present
@@ -391,13 +366,6 @@ class UsdWriter(ColoredStage):
             OSError: It could not be written, for example because the disk is full; former frames stay and play.
         """
         self._check_open()
-        given = Statics(velocities is not None, von_mises is not None, touched is not None)
-        if self._given is None:
-            self._given = given
-            self.declare(self._static_layer(), self._drawn_anew())
-        elif given != self._given:
-            raise InputError("velocities, von_mises and contact must be given either for every frame or for none")
-
         x = floats(positions, self._present.points.shape, "positions")
         v = None if velocities is None else floats(velocities, x.shape, "velocities")
         stress = nodal = None
@@ -406,10 +374,16 @@ class UsdWriter(ColoredStage):
             nodal = self._present.average(stress)
         self.layer_data = {KEY: self.about} if self.about else {}
         frame = Frame(x, v, stress, nodal, touched)
-        samples: Samples = {}
+        given = tuple(each is not None for each in frame)
+        if self._given is None:
+            self._given, self._layer = given, self._static_layer(frame)
+        elif given != self._given:
+            raise InputError("velocities, von_mises and contact must be given either for every frame or for none")
+        samples, follows = dict[str, Any](), dict[str, str]()
         for prim in self._prims:
             samples |= prim.samples(frame)
-        self._add(samples, stress)
+            follows |= prim.follows
+        self._add(self._layer, samples, stress, follows=follows if self._changing else {})
 
     def _colors(self, samples: Samples) -> Samples:
         colors: Samples = {}
@@ -417,15 +391,8 @@ class UsdWriter(ColoredStage):
             colors |= prim.colors(samples, self.stress_range)
         return colors
 
-    def _drawn_anew(self) -> dict[str, str]:
-        found: dict[str, str] = {}
-        for prim in self._prims:
-            found |= prim.follows
-        return found if self._changing else {}
-
-    def _static_layer(self) -> Sdf.Layer:
-        """The layer with everything that does not change, and the attributes that do, without values."""
-        assert self._given is not None
+    def _static_layer(self, frame: Frame) -> Sdf.Layer:
+        """The layer with everything that does not change, for frames like this one."""
         layer = Sdf.Layer.CreateAnonymous(".usdc")
         stage = Usd.Stage.Open(layer)
         UsdGeom.SetStageUpAxis(stage, self._up_axis)
@@ -436,7 +403,7 @@ class UsdWriter(ColoredStage):
         stage.SetDefaultPrim(root)
         Usd.ModelAPI(root).SetKind(Kind.Tokens.component)
         for prim in self._prims:
-            prim.declare(stage, self._given)
+            prim.define(stage, frame)
         declare_physics(
             stage,
             self._present,
@@ -445,10 +412,6 @@ class UsdWriter(ColoredStage):
             gravity=self._gravity,
         )
         return layer
-
-
-def _boundary(present: Present) -> list[Skin]:
-    return [Skin("surface", boundary_surface(present), is_boundary=True)]
 
 
 def _present(mesh: Mesh, fixed: ArrayLike | None, material: Any) -> Present:
