@@ -1,9 +1,13 @@
 """The stiffness of a dilatation that groups of elements share, as one row a group.
 
 A group adds c g g^T to K, with g the derivative of the sum of lambda_e V_e theta_e with respect to its nodes'
-displacements and c = w'' / sum of lambda_e V_e. The rows g are found once for each linearisation, so that a product
-reads ten nodes for eight elements and no element. What elements add besides is left to ``dilatation`` and, where
-some of them are held from turning over, to ``add_held``.
+displacements and c = w'' / sum of lambda_e V_e. The rows r = sqrt(|c|) g are found once for each linearisation, so that
+a product reads ten nodes for eight elements and no element. What elements add besides is left to ``dilatation`` and,
+where some of them are held from turning over, to ``add_held``.
+
+A group of k nodes couples all of them: r r^T may be k times its own diagonal blocks. It is at most 4 times these with
+weights w_n = sum of |r_m| / (4 |r_n|), since (sum of r_n . p_n)^2 <= sum of |r_m| times sum of (r_n . p_n)^2 / |r_n|.
+The smoothers of ``implicit.multigrid`` take these weights.
 """
 
 import warp as wp
@@ -22,6 +26,8 @@ OF_GROUPS = Family(__name__, LAW_HEADERS)
 
 #: Threads that share a group on CUDA.
 THREADS = 8
+#: Lambda over mu that is no limit.
+NO_LIMIT = 1.0e30
 
 
 @wp.struct
@@ -42,8 +48,8 @@ class GroupNodes:
 class GroupRows:
     """The rows of groups."""
 
-    rows: wp.array[wp.vec4]  # [entries] g [N/m]
-    factors: wp.array[wp.vec2]  # [groups] c [1/J], and whether an element is held: zero or more
+    rows: wp.array[wp.vec4]  # [entries] r [sqrt(N/m)], with w - 1 in the fourth lane for matrices
+    factors: wp.array[wp.vec2]  # [groups] the sign of c, and whether an element is held: zero or more
 
 
 # --- the groups -------------------------------------------------------------------------------------------------------
@@ -141,44 +147,72 @@ def name_nodes(
 
 
 @wp.func
+def row_at(rows: wp.array[wp.vec4], place: int):
+    row = rows[place]
+    return wp.vec3(row[0], row[1], row[2])
+
+
+@wp.func
 def add_row(rows: wp.array[wp.vec4], place: int, row: wp.vec3):
     rows[place] = rows[place] + wp.vec4(row[0], row[1], row[2], 0.0)
 
 
+@wp.func
+def kept_share(lam: float, mu: float, most: float):
+    """The share of a group's lambda that is left if it is ``most`` mu at most."""
+    share = float(1.0)
+    if lam > most * mu:
+        share = most * mu / lam
+    return share
+
+
 @OF_GROUPS.member
 def write_rows(Elements: type, of: Dilatation) -> wp.Kernel:
-    """A thread a group, which also leaves (lambda_e h'', w', 0, 0) to its elements: the first for
-    ``add_held``, the second for ``dilatation.own_differential``."""
+    """Write the rows of groups from ``begin`` on at displacements u; a thread a group of each world.
+
+    A product's groups are those of all worlds as one, of all lambda. It also needs ``factors``, and the elements'
+    (lambda_e h'', w', 0, 0) in ``shared``: the first for ``add_held``, the second for ``dilatation.own_differential``.
+    A matrix has no ``shared``: then rows with c < 0 are zero, and lambda counts as ``most`` mu at most.
+    """
     measure, slope_of, curvature_of, holding = of.measure, of.slope, of.curvature, of.holding
 
     @OF_GROUPS.kernel()
     def write_rows(
         # In
-        elements: Elements,
-        material: IsotropicMaterial,
-        u: wp.array[wp.vec4],
+        begin: int,
+        world_elements: int,
+        entries: int,
         groups: GroupNodes,
+        elements: Elements,
+        u: wp.array[wp.vec4],
+        material: IsotropicMaterial,
+        most: float,
         # Out
         found: GroupRows,
         shared: wp.array[wp.vec4],
     ):
-        g = wp.tid()
-        first = first_entry(groups.ends, g)
-        for k in range(first, groups.ends[g]):
+        world, g = wp.tid()
+        g += begin
+        first = world * entries + first_entry(groups.ends, g)
+        end = world * entries + groups.ends[g]
+        for k in range(first, end):
             found.rows[k] = wp.vec4()
         sum = float(0.0)
         total = float(0.0)
+        shear = float(0.0)
         held = float(0.0)
         for i in range(groups.ranges[g][0], groups.ranges[g][1]):
-            t = groups.members[i]
+            t = world * world_elements + groups.members[i]
             theta, slope = measure(own_gradient(elements, t, u))
             lam = material.lam[t * material.stride]
-            weight = lam * rest_volume(elements, t)
-            sum += weight * theta
-            total += weight
-            change = holding(theta)[2]
-            held = wp.max(held, change)
-            shared[t] = wp.vec4(lam * change, 0.0, 0.0, 0.0)
+            volume = rest_volume(elements, t)
+            sum += lam * volume * theta
+            total += lam * volume
+            shear += material.mu[t * material.stride] * volume
+            if shared.shape[0] > 0:
+                change = holding(theta)[2]
+                held = wp.max(held, change)
+                shared[t] = wp.vec4(lam * change, 0.0, 0.0, 0.0)
             # Forces are minus the derivative of the energy, and this is that of the sum.
             f0, f1, f2, f3 = nodal_forces(elements, t, in_local_frame(elements, t, -lam * slope))
             corners = groups.corners[i]
@@ -187,10 +221,25 @@ def write_rows(Elements: type, of: Dilatation) -> wp.Kernel:
             add_row(found.rows, first + ((corners >> 16) & 255), f2)
             add_row(found.rows, first + ((corners >> 24) & 255), f3)
         theta = mean_of(sum, total)
-        found.factors[g] = wp.vec2(mean_of(curvature_of(theta), total), held)
-        for i in range(groups.ranges[g][0], groups.ranges[g][1]):
-            t = groups.members[i]
-            shared[t] = wp.vec4(shared[t][0], slope_of(theta), 0.0, 0.0)
+        c = mean_of(curvature_of(theta), total)
+        if shared.shape[0] > 0:
+            found.factors[g] = wp.vec2(wp.sign(c), held)
+            for i in range(groups.ranges[g][0], groups.ranges[g][1]):
+                t = groups.members[i]
+                shared[t] = wp.vec4(shared[t][0], slope_of(theta), 0.0, 0.0)
+        else:
+            c = wp.where(total > 0.0, kept_share(total, shear, most) * wp.max(c, 0.0), 0.0)
+        factor = wp.sqrt(wp.abs(c))
+        size = float(0.0)
+        for k in range(first, end):
+            size += factor * wp.length(row_at(found.rows, k))
+        for k in range(first, end):
+            row = factor * row_at(found.rows, k)
+            own = wp.length(row)
+            weight = float(1.0)
+            if own > 0.0 and shared.shape[0] == 0:
+                weight = 0.25 * size / own
+            found.rows[k] = wp.vec4(row[0], row[1], row[2], weight - 1.0)
 
     return write_rows
 
@@ -253,7 +302,7 @@ def add_row_products(
     # In and out
     y: wp.array[wp.vec4],
 ):
-    """y += c g (g . p)."""
+    """y += c g (g . p), which is the sign of c times r (r . p)."""
     thread = wp.tid()
     g = thread / lanes
     begin = first_entry(groups.ends, g)
@@ -302,6 +351,5 @@ def add_row_blocks(
     """The diagonal blocks of c g g^T; a thread a group."""
     g = wp.tid()
     for k in range(first_entry(groups.ends, g), groups.ends[g]):
-        row = found.rows[k]
-        v = wp.vec3(row[0], row[1], row[2])
+        v = row_at(found.rows, k)
         wp.atomic_add(blocks, groups.nodes[k], found.factors[g][0] * wp.outer(v, v))

@@ -134,6 +134,7 @@ class NativeLaw(NamedTuple):
 
 
 FIBRES = NativeLaw("corot::fibres(material)", "law_fibres")
+ORTHOTROPIC = NativeLaw("corot::orthotropic(material)", "law_orthotropic", True)
 PRONY = NativeLaw("corot::prony(material)", "added")
 PRESTRESS = NativeLaw("corot::prestressed(material)", "added")
 VISCOUS = NativeLaw("corot::viscous(material)", "added", True)

@@ -9,10 +9,9 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import warp as wp
 
 from warp_corot.discretization.discretization import Discretization, discretization_of
-from warp_corot.discretization.elements import E, copied
 from warp_corot.discretization.plan import Plan
 from warp_corot.elasticity.clusters import divided
-from warp_corot.elasticity.cpu import Lanes, SimdForces, as_general
+from warp_corot.elasticity.cpu import SimdForces
 from warp_corot.elasticity.dilatation import AUTO, bind_law, check_dilatation
 from warp_corot.elasticity.model import ElementField, ForceField, Kept, Model
 from warp_corot.errors import InputError
@@ -28,14 +27,11 @@ from warp_corot.kernels.corotated.anisotropic import (
     fibre_differential,
     fibre_stress,
     reinforced_cauchy,
-    scatter_anisotropic_simd8,
-    turn_changed,
-    turn_elements,
 )
 from warp_corot.kernels.corotated.well_conditioned import quaternions_of
 from warp_corot.kernels.elements.dilatation import LOG_VOLUME
-from warp_corot.kernels.elements.forces import element_energies, repair_forces
-from warp_corot.kernels.elements.simd8 import FIBRES
+from warp_corot.kernels.elements.forces import element_energies
+from warp_corot.kernels.elements.simd8 import FIBRES, ORTHOTROPIC
 from warp_corot.kernels.math.rotation import byers_xu, quick_rotation
 from warp_corot.kernels.subtrees.anisotropic import repair_leaves, scatter_anisotropic_subtrees, scatter_flat
 from warp_corot.kernels.subtrees.degenerate import NO_LIST
@@ -96,7 +92,8 @@ class AnisotropicField(FibreField):
     both momenta. It does work, and has no energy.
 
     The stiffness is exact, with the derivative of R, at the present active stress; it is bounded if the rotation of F
-    is ill-defined (``kernels.corotated.tangent``).
+    is ill-defined (``kernels.corotated.tangent``). On the CPU eight subtrees or elements are computed at a time, unless
+    the model asks for other rotations.
 
     Args:
         discretization: A discretization with an ``Anisotropic`` material.
@@ -105,6 +102,7 @@ class AnisotropicField(FibreField):
     """
 
     def __init__(self, discretization: Discretization, rotation: wp.Function, deterministic: bool):
+        self._quick = rotation is quick_rotation and discretization.device.is_cpu
         super().__init__(
             discretization,
             stress=fibre_stress(rotation),
@@ -114,6 +112,12 @@ class AnisotropicField(FibreField):
             Material=FibreMaterial,
             deterministic=deterministic,
         )
+        if self._quick:
+            law, robust = (lambda: self.fibres), fibre_stress(byers_xu)
+            self._simd = SimdForces(discretization, self.plan, ORTHOTROPIC, law, FibreMaterial, robust)
+
+    def plan_of(self, discretization: Discretization) -> Plan:
+        return discretization.plan(subtrees=self._quick, deterministic=self.deterministic)
 
     @property
     def material(self) -> FibreMaterial:
@@ -122,43 +126,6 @@ class AnisotropicField(FibreField):
     @property
     def material_shown(self) -> FibreMaterial:
         return self.fibres
-
-
-class AnisotropicSimd8Field(AnisotropicField):
-    """On the CPU, eight elements at a time."""
-
-    def __init__(self, discretization: Discretization, rotation: wp.Function, deterministic: bool):
-        super().__init__(discretization, rotation, deterministic)
-        # The elements as general ones, with rest matrices in the material's axes.
-        inputs = [self.elements, self.passive]
-        self._general = as_general(self.elements, turn_elements(discretization.element_kind), inputs)
-        self.follow()
-
-    @property
-    def _force_kernels(self) -> list[LoadedKernel]:
-        repair = repair_forces(self.discretization.element_kind, FibreMaterial, fibre_stress(byers_xu))
-        return [scatter_anisotropic_simd8, repair]
-
-    def follow(self) -> None:
-        scatter, repair = self._force_kernels
-        elements, general = (_first(each, self.element_count) for each in (self.elements, self._general))
-        self._lanes = Lanes(elements, general, scatter=scatter, repair=repair)
-
-    def derive(self) -> None:
-        counts = self.plan.counts
-        assert counts is not None
-        inputs = [counts.threads, counts.goes, counts.now, counts.before, self.elements, self.passive]
-        self.launch(turn_changed, counts.threads, inputs, [self._general.rest_inverse, self._general.volume])
-
-    def scatter_forces(self, u: wp.array, f: wp.array) -> None:
-        self._lanes.scatter_forces(self.fibres, u, f)
-
-
-def _first(elements: E, count: int) -> E:
-    """The first elements of either kind."""
-    some = copied(elements)
-    some.nodes = some.targets = elements.nodes[:count]
-    return some
 
 
 # --- on CUDA: subtrees, clusters, and elements one by one ------------------------------------------------------------

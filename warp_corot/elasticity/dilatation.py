@@ -25,6 +25,7 @@ from warp_corot.inputs.loading import LoadedKernel, load
 from warp_corot.kernels.elements import dilatation as kernels
 from warp_corot.kernels.elements import mean_dilatation_rows as rows
 from warp_corot.kernels.elements.dilatation import SMALL, VOLUME, Dilatation, DilatedMaterial
+from warp_corot.kernels.elements.mean_dilatation_rows import NO_LIMIT
 from warp_corot.kernels.elements.simd8 import LANES, STRESSLESS
 from warp_corot.kernels.subtrees import cpu as subtree_cpu
 from warp_corot.kernels.subtrees import cuda as subtree_cuda
@@ -83,9 +84,9 @@ class SharedTangent(Tangent):
         super().take(u)
         self.shear.take(u)
         field = self.field
-        inputs = [field.elements, field.isotropic, self.displacements, self._members.arrays]
+        inputs = [0, 0, 0, self._members.arrays, field.elements, self.displacements, field.isotropic, NO_LIMIT]
         outputs = [self._rows, self.shared]
-        field.launch(rows.write_rows(field.kind, field.of), self._members.count, inputs, outputs)
+        field.launch(rows.write_rows(field.kind, field.of), (1, self._members.count), inputs, outputs)
 
     def add_product(self, p: wp.array, y: wp.array) -> None:
         self.shear.add_product(p, y)

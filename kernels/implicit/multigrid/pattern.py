@@ -4,24 +4,21 @@ An entry in the upper triangle, or on the diagonal, is a sum of contributions: o
 next finer level's entries on the others (Galerkin). Contributions are listed with their pair of ranks as a key, and
 sorted.
 
-A group of elements that share their dilatation adds r r^T with r = sqrt(c) g of
-``kernels.elements.mean_dilatation_rows``, so each pair of its nodes contributes to an entry. Rows belong to the present
-state, because lambda may be thousands of times mu.
-
-A group of k nodes couples all of them: r r^T may be k times its own diagonal blocks. It is at most 4 times these with
-weights w_n = sum of |r_m| / (4 |r_n|), since (sum of r_n . p_n)^2 <= sum of |r_m| times sum of (r_n . p_n)^2 / |r_n|.
-Smoothing takes the diagonal with these weights, and so keeps its bound. On coarser levels, where most groups have four
-nodes and few have more, ``bound_diagonal`` keeps it.
+A group of elements that share their dilatation adds r r^T with the rows r of ``elements.mean_dilatation_rows``, so each
+pair of its nodes contributes to an entry. Rows belong to the present state, because lambda may be thousands of times
+mu. Smoothing takes the diagonal with the weights of groups, and so keeps its bound. On coarser levels, where most
+groups have four nodes and few have more, ``bound_diagonal`` keeps it.
 """
+
+import functools
 
 import warp as wp
 
 from warp_corot.kernels.elements.dilatation import Dilatation
 from warp_corot.kernels.elements.elements import ForestElements, nodal_forces, rest_volume
 from warp_corot.kernels.elements.forces import in_local_frame, own_gradient
-from warp_corot.kernels.elements.mean_dilatation_rows import GroupNodes, first_entry
-from warp_corot.kernels.elements.simd8 import LAW_HEADERS
-from warp_corot.kernels.modules import Family
+from warp_corot.kernels.elements.mean_dilatation_rows import GroupNodes, first_entry, kept_share  # noqa: F401
+from warp_corot.kernels.elements.simd8 import law_kernel
 
 from .cycle import LevelArrays
 
@@ -269,9 +266,6 @@ def list_midpoints(
         midpoints[2 * i + n] = node
 
 
-OF_MATRIX = Family(__name__, LAW_HEADERS)
-
-
 @wp.kernel(enable_backward=False)
 def count_pairs(groups: GroupNodes, counts: wp.array[wp.int32]):
     """Count the pairs of a group's nodes, including each node with itself."""
@@ -312,96 +306,12 @@ def list_pairs(
             at += 1
 
 
-@wp.func
-def row_at(rows: wp.array[wp.vec4], place: int):
-    row = rows[place]
-    return wp.vec3(row[0], row[1], row[2])
-
-
-@wp.func
-def add_row(rows: wp.array[wp.vec4], place: int, part: wp.vec3):
-    rows[place] = rows[place] + wp.vec4(part[0], part[1], part[2], 0.0)
-
-
-@wp.func
-def kept_share(lam: float, mu: float, most: float):
-    """The share of a group's lambda that is left if it is ``most`` mu at most."""
-    share = float(1.0)
-    if lam > most * mu:
-        share = most * mu / lam
-    return share
-
-
-@OF_MATRIX.member
-def write_rows(of: Dilatation) -> wp.Kernel:
-    """Write the rows of groups from ``begin`` on at displacements u, with w - 1 in the fourth lane; lambda counts as
-    ``most`` mu at most."""
-    measure, curvature_of = of.measure, of.curvature
-
-    @OF_MATRIX.kernel()
-    def write_rows(
-        # In
-        begin: int,
-        world_elements: int,
-        entries: int,
-        groups: GroupNodes,
-        elements: ForestElements,
-        u: wp.array[wp.vec4],
-        mu: wp.array[float],
-        lam: wp.array[float],
-        stride: int,
-        most: float,
-        # Out
-        rows: wp.array[wp.vec4],
-    ):
-        world, g = wp.tid()
-        g += begin
-        first = world * entries + first_entry(groups.ends, g)
-        end = world * entries + groups.ends[g]
-        for k in range(first, end):
-            rows[k] = wp.vec4()
-        sum = float(0.0)
-        total = float(0.0)
-        shear = float(0.0)
-        for i in range(groups.ranges[g][0], groups.ranges[g][1]):
-            t = world * world_elements + groups.members[i]
-            theta, slope = measure(own_gradient(elements, t, u))
-            modulus = lam[t * stride]
-            weight = modulus * rest_volume(elements, t)
-            sum += weight * theta
-            total += weight
-            shear += mu[t * stride] * rest_volume(elements, t)
-            f0, f1, f2, f3 = nodal_forces(elements, t, in_local_frame(elements, t, -modulus * slope))
-            corners = groups.corners[i]
-            add_row(rows, first + (corners & 255), f0)
-            add_row(rows, first + ((corners >> 8) & 255), f1)
-            add_row(rows, first + ((corners >> 16) & 255), f2)
-            add_row(rows, first + ((corners >> 24) & 255), f3)
-        factor = float(0.0)
-        if total > 0.0:
-            factor = wp.sqrt(kept_share(total, shear, most) * wp.max(curvature_of(sum / total), 0.0) / total)
-        size = float(0.0)
-        for k in range(first, end):
-            row = factor * row_at(rows, k)
-            rows[k] = wp.vec4(row[0], row[1], row[2], 0.0)
-            size += wp.length(row)
-        for k in range(first, end):
-            row = row_at(rows, k)
-            own = wp.length(row)
-            weight = float(1.0)
-            if own > 0.0:
-                weight = 0.25 * size / own
-            rows[k] = wp.vec4(row[0], row[1], row[2], weight - 1.0)
-
-    return write_rows
-
-
-@OF_MATRIX.member
+@functools.cache
 def add_held_blocks(of: Dilatation) -> wp.Kernel:
     """Add the stiffness of elements that are held from turning over, off the diagonal; see ``elements.dilatation``."""
     measure, holding = of.measure, of.holding
 
-    @OF_MATRIX.kernel()
+    @law_kernel()
     def add_held_blocks(
         # In
         world_elements: int,

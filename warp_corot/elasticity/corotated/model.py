@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import warp as wp
 
-from warp_corot.elasticity.anisotropic import AnisotropicCudaField, AnisotropicField, AnisotropicSimd8Field
+from warp_corot.elasticity.anisotropic import AnisotropicCudaField, AnisotropicField
 from warp_corot.elasticity.corotated.fields import (
     CorotatedField,
     CorotatedGeneralField,
@@ -148,8 +148,6 @@ class Corotated(CorotatedOptions):
             raise InputError(f"the material is {name}; only the model HolzapfelGasserOgden supports this material")
         if self.rotation_level is not None:
             raise InputError(f"rotation_level is {self.rotation_level!r}; with an anisotropic material it must be None")
-        quick = self.own_rotation is quick_rotation
-        if quick and discretization.device.is_cuda and not deterministic:
+        if self.own_rotation is quick_rotation and discretization.device.is_cuda and not deterministic:
             return AnisotropicCudaField(discretization)
-        lanes = quick and discretization.device.is_cpu
-        return (AnisotropicSimd8Field if lanes else AnisotropicField)(discretization, self.own_rotation, deterministic)
+        return AnisotropicField(discretization, self.own_rotation, deterministic)

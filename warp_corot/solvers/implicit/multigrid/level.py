@@ -10,8 +10,10 @@ import warp as wp
 
 from warp_corot.discretization.discretization import Discretization
 from warp_corot.discretization.groups import Members
+from warp_corot.elasticity.model import isotropic_material
 from warp_corot.inputs.cpu_threads import Regions, launch
 from warp_corot.kernels.elements.elements import ForestElements
+from warp_corot.kernels.elements.mean_dilatation_rows import NO_LIMIT, GroupRows, write_rows
 from warp_corot.kernels.implicit.multigrid import cycle, dense, values
 from warp_corot.kernels.implicit.multigrid import pattern as kernels
 from warp_corot.kernels.tables.shapes import GRADIENT
@@ -309,7 +311,9 @@ class LeafMatrix:
         weights = np.swapaxes(np.array(GRADIENT), 1, 2).reshape(12, 3)
         self._gradients = wp.array(weights, dtype=wp.vec3, device=self.device)
         rows = 0 if members is None else sizes.worlds * members.entries
-        self._rows = wp.zeros(rows, dtype=wp.vec4, device=self.device)
+        self._rows = GroupRows()
+        self._rows.rows = wp.zeros(rows, dtype=wp.vec4, device=self.device)
+        self._no_elements = wp.zeros(0, dtype=wp.vec4, device=self.device)
         more = sizes.worlds * len(nodes) if is_bounded else 1
         self._more = wp.zeros(more, dtype=wp.mat33, device=self.device)
 
@@ -317,7 +321,7 @@ class LeafMatrix:
     def kernels(self) -> list[wp.Kernel]:
         """Kernels that it launches, beside those of ``loading.IMPLICIT_ON_FORESTS``."""
         found = [self._write_frames, values.gather_leaves]
-        return found if self._members is None else [*found, kernels.write_rows(self._members.law)]
+        return found if self._members is None else [*found, write_rows(ForestElements, self._members.law)]
 
     @property
     def _elements(self) -> ForestElements:
@@ -330,8 +334,8 @@ class LeafMatrix:
         inverses: wp.array,
         *,
         stiffening: float = 0.0,
-        most_lambda: float = 1e30,
-        most_shared: float = 1e30,
+        most_lambda: float = NO_LIMIT,
+        most_shared: float = NO_LIMIT,
         holds: bool = False,
     ) -> None:
         """Launch the matrix at the operator's displacements and scales; its ``other_blocks`` are on the diagonal.
@@ -350,9 +354,10 @@ class LeafMatrix:
             self._write_frames, sizes.elements, lambda _, own: ([own(elements), u], [own(self._frames)]), u.ptr
         )
         if members is not None:
-            inputs: list[Any] = [sizes.world_elements, members.entries, members.arrays, elements, u]
-            inputs += [body.mu, body.lam, body.material_stride, most_shared]
-            self._launch(kernels.write_rows(members.law), members.count, inputs, [self._rows], u.ptr, most_shared)
+            material = isotropic_material([body.mu, body.lam, body.material_stride])
+            inputs: list[Any] = [sizes.world_elements, members.entries, members.arrays, elements, u, material]
+            kernel, outputs = write_rows(ForestElements, members.law), [self._rows, self._no_elements]
+            self._launch(kernel, members.count, [*inputs, most_shared], outputs, u.ptr, most_shared)
         leaves = self._leaves(operator, blocks, stiffening, most_lambda)
         threads = 1 if self.device.is_cpu else len(found.sums.upper)
         parts = threads * self._regions.team.parts
@@ -379,7 +384,7 @@ class LeafMatrix:
         leaves.mu, leaves.lam, leaves.stride = body.mu, body.lam, body.material_stride
         leaves.sums, leaves.entries, leaves.ranks = found.sums, found.entries, len(self._nodes)
         leaves.mesh_nodes, leaves.nodes, leaves.free = self._mesh_nodes, self._nodes, self._free
-        leaves.pairs, leaves.rows, leaves.more, leaves.blocks = self._pairs, self._rows, self._more, blocks
+        leaves.pairs, leaves.rows, leaves.more, leaves.blocks = self._pairs, self._rows.rows, self._more, blocks
         leaves.scales, leaves.stiffening, leaves.inverse_mass = operator.scales, stiffening, operator.inverse_mass
         leaves.others, leaves.most_lambda = operator.other_blocks(), most_lambda
         if operator.tension is not None and self.is_turned:
