@@ -11,8 +11,9 @@ from typing import Any
 import warp as wp
 
 #: Flags for the CPU's compiler with which it inlines the largest functions: those that are given structs of many arrays
-#: would copy these at each call.
-INLINED = "-march=native -mllvm=-inline-threshold=200000 -mllvm=-slp-recursion-max-depth=4"
+#: would copy these at each call; and with which it also uses all instructions of the processor.
+WITHOUT_COPIES = "-mllvm=-inline-threshold=200000"
+INLINED = f"-march=native {WITHOUT_COPIES} -mllvm=-slp-recursion-max-depth=4"
 
 
 def unique_kernel(

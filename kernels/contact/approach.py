@@ -17,7 +17,7 @@ from .bearing import carriers_of, find_borne
 from .explicit_rows import FORESEEN, OUT, Rigid
 from .explicit_step import push
 from .mass_split import Sums, take_force
-from .motion import Bearing, Dynamics, Foreseen, Motions, Surface, distance_between, foreseen, kick_of
+from .motion import Bearing, Dynamics, Foreseen, Surface, distance_between, foreseen, kick_of
 from .shapes import GROUND, distance_to, sure_distance
 from .watch import BESIDE, FAR, FARTHEST, STABLE, Near, Watch, begin_obstacle, pair_of
 
@@ -37,6 +37,8 @@ class Part:
     shift: int  # how much larger the numbers of these are among all carriers
     nodes: Surface
     dynamics: Dynamics
+    pace: Pace
+    offset: int  # the number of the step since the clock was last advanced
 
 
 @wp.struct
@@ -58,7 +60,6 @@ class Visits:
     is_first: wp.array[wp.int32]  # [1] whether this step visits everything
     may_miss: wp.array[wp.int32]  # [1] whether places may not have moved into obstacles unseen
     count: wp.array[wp.int32]  # [1] the number of steps, ever
-    body: wp.array[wp.int32]  # [S] the body of a place
     first_place: wp.array[wp.int32]  # [bodies]
     places: wp.array[wp.int32]  # [S] that number at the last visit to a place
     touches: wp.array[wp.int32]  # [O T] the same for an obstacle and a triangle
@@ -72,10 +73,11 @@ class Visits:
     due_count: wp.array[wp.int32]
     carrying: wp.array[wp.int32]  # [N] those whose motion is known
     carrying_count: wp.array[wp.int32]
-    triangles: wp.array[wp.vec3i]  # [T]
-    corner_starts: wp.array[wp.int32]  # [S + 1] the triangles around each place, see ``Skin``
-    corners: wp.array[wp.int32]
     is_shared: int  # whether several threads visit at the same time
+    has_edges: int  # whether an obstacle can pass between nodes
+    rigid: Rigid
+    watch: Watch
+    here: Near  # what may touch in this step
 
 
 # Where one thread works, plain instructions take a fraction of the time of atomic ones.
@@ -108,14 +110,14 @@ def append(list: wp.array[wp.int32], first: int, counts: wp.array[wp.int32], k: 
 
 
 @wp.func
-def choose(s: int, here: Near, visits: Visits):
+def choose(s: int, visits: Visits):
     """Visit a place in this step, once. Returns whether it was not chosen before."""
     was = visits.places[s]
     if not claim(visits.places, s, visits.count[0], visits.is_shared):
         return False
-    k = visits.body[s]
+    k = visits.rigid.surface.body[s]
     append(visits.chosen, visits.first_place[k], visits.chosen_count, k, s, visits.is_shared)
-    here.flags[s] = BESIDE | wp.where(was + 1 < visits.count[0], LATE, 0)
+    visits.here.flags[s] = BESIDE | wp.where(was + 1 < visits.count[0], LATE, 0)
     return True
 
 
@@ -164,19 +166,12 @@ def find_entries(bearing: Bearing, entries: wp.array[wp.vec4i]):
 
 
 @wp.kernel(enable_backward=False)
-def begin_visits(
-    # In
-    motions: Motions,
-    pace: Pace,
-    world_starts: wp.array[wp.float64],
-    offset: int,
-    rigid: Rigid,
-    # In and out
-    watch: Watch,
-    here: Near,
-    visits: Visits,
-):
+def begin_visits(pace: Pace, world_starts: wp.array[wp.float64], offset: int, visits: Visits):
     """Move obstacles, and forget the visits of the last step."""
+    rigid = visits.rigid
+    motions = rigid.motions
+    watch = visits.watch
+    here = visits.here
     meets = float(0.0)
     for k in range(watch.poses.shape[0] * watch.poses.shape[1]):
         world, o = pair_of(k, watch)
@@ -280,20 +275,11 @@ def know(n: int, own: Foreseen, part: Part, visits: Visits):
 
 
 @wp.kernel(enable_backward=False)
-def find_due(
-    # In
-    begin: int,
-    end: int,
-    part: Part,
-    pace: Pace,
-    offset: int,
-    # In and out
-    watch: Watch,
-    visits: Visits,
-):
+def find_due(begin: int, end: int, part: Part, visits: Visits):
     """List the carriers from ``begin`` to ``end`` of a body whose budgets this step may use up."""
     body = part.dynamics
-    dt = float(pace.seconds[DT])
+    watch = visits.watch
+    dt = float(part.pace.seconds[DT])
     damped = 1.0 / (1.0 + dt * body.damping)
     used = visits.came[0] + AHEAD * visits.came[1] + watch.least[0]
     is_first = visits.is_first[0] != 0
@@ -301,14 +287,14 @@ def find_due(
     while n < end:
         if not is_first and body.load.shape[0] == 0:
             n = next_due(
-                n, end, part.shift, used, kick_of(pace, offset), damped, AHEAD * dt, body.gravity, part.nodes.node,
-                visits.budgets, body.inverse_mass, body.f, body.u, body.v,
+                n, end, part.shift, used, kick_of(part.pace, part.offset), damped, AHEAD * dt, body.gravity,
+                part.nodes.node, visits.budgets, body.inverse_mass, body.f, body.u, body.v,
             )  # fmt: skip
         if n < end and part.nodes.node[n] >= 0:
             i = part.nodes.node[n]
             c = n + part.shift
             budget = visits.budgets[c]
-            own = foreseen(i, body, pace, offset)
+            own = foreseen(i, body, part.pace, part.offset)
             gone = wp.length(load_node(body.u, i) - wp.vec3(budget[0], budget[1], budget[2]))
             goes = AHEAD * wp.length(own.d)
             if is_first or not (gone + goes <= budget[3] - used):
@@ -348,26 +334,26 @@ def position_of(s: int, part: Part, surface: Surface, share: float):
 
 
 @wp.func
-def longest_edge(s: int, x: wp.vec3, share: float, part: Part, surface: Surface, visits: Visits):
+def longest_edge(s: int, x: wp.vec3, share: float, part: Part, surface: Surface):
     """The longest edge from a place at x [m]; ``share`` as for ``position_of``."""
     longest = float(0.0)
-    for c in range(visits.corner_starts[s], visits.corner_starts[s + 1]):
+    for c in range(surface.corner_starts[s], surface.corner_starts[s + 1]):
         # Each edge belongs to two triangles, in one of which its end comes next.
-        r = visits.triangles[visits.corners[c] / 3][(visits.corners[c] + 1) % 3]
+        r = surface.triangles[surface.corners[c] / 3][(surface.corners[c] + 1) % 3]
         longest = wp.max(longest, wp.length(position_of(r, part, surface, share) - x))
     return longest
 
 
 @wp.func
-def carry(s: int, part: Part, pace: Pace, offset: int, surface: Surface, visits: Visits):
+def carry(s: int, part: Part, visits: Visits):
     """Find the motion of the carriers of a place in this step without contact, and begin to measure their way here."""
-    b, _w = carriers_of(s, surface)
+    b, _w = carriers_of(s, visits.rigid.surface)
     for m in range(4):
         c = b[m]
         n = c - part.shift
         if claim(visits.carriers, c, visits.count[0], visits.is_shared):
             i = part.nodes.node[n]
-            know(n, foreseen(i, part.dynamics, pace, offset), part, visits)
+            know(n, foreseen(i, part.dynamics, part.pace, part.offset), part, visits)
             now = load_node(part.dynamics.u, i)
             budget = visits.budgets[c]
             gone = wp.length(now - wp.vec3(budget[0], budget[1], budget[2]))
@@ -376,8 +362,11 @@ def carry(s: int, part: Part, pace: Pace, offset: int, surface: Surface, visits:
 
 
 @wp.func
-def room_beside(s: int, has_edges: int, part: Part, rigid: Rigid, watch: Watch, visits: Visits, here: Near):
+def room_beside(s: int, part: Part, visits: Visits):
     """How far a place may go before it or a triangle around it may touch an obstacle [m]; those that may are listed."""
+    rigid = visits.rigid
+    watch = visits.watch
+    here = visits.here
     surface = rigid.surface
     x = surface.x[s]
     close = FORESEEN * (wp.length(surface.d[s]) + visits.came[1])
@@ -387,7 +376,7 @@ def room_beside(s: int, has_edges: int, part: Part, rigid: Rigid, watch: Watch, 
     for o in range(rigid.shapes.kind.shape[0]):
         r = o * surface.node.shape[0] + s
         span = float(0.0)
-        if has_edges != 0 and rigid.shapes.kind[o] != GROUND:
+        if visits.has_edges != 0 and rigid.shapes.kind[o] != GROUND:
             span = LONG * visits.spans[s]
         pose = rigid.motions.now[surface.world[s], o]
         distance, _n = distance_to(rigid.shapes, o, pose, x, room + span + rigid.law.tolerance)
@@ -404,11 +393,11 @@ def room_beside(s: int, has_edges: int, part: Part, rigid: Rigid, watch: Watch, 
         if span == 0.0 or gap > span:
             room = wp.min(room, gap - span)
         else:
-            longest = longest_edge(s, x, 1.0, part, surface, visits)
+            longest = longest_edge(s, x, 1.0, part, surface)
             room = wp.min(room, wp.min(gap - longest, GROWN * longest))
             if gap <= COVERED * longest + close + watch.least[0]:
-                for c in range(visits.corner_starts[s], visits.corner_starts[s + 1]):
-                    pair = o * visits.triangles.shape[0] + visits.corners[c] / 3
+                for c in range(surface.corner_starts[s], surface.corner_starts[s + 1]):
+                    pair = o * surface.triangles.shape[0] + surface.corners[c] / 3
                     if claim(visits.touches, pair, 1, visits.is_shared):
                         append(here.touches, 0, here.touch_count, 0, pair, visits.is_shared)
     if may_touch:
@@ -420,32 +409,15 @@ def room_beside(s: int, has_edges: int, part: Part, rigid: Rigid, watch: Watch, 
 
 
 @wp.kernel(enable_backward=False)
-def visit(
-    # In
-    threads: int,
-    thread: int,
-    first: int,
-    last: int,
-    part: Part,
-    pace: Pace,
-    offset: int,
-    has_edges: int,
-    watch: Watch,
-    # In and out
-    rigid: Rigid,
-    visits: Visits,
-    # Out
-    here: Near,
-):
+def visit(threads: int, thread: int, first: int, last: int, part: Part, visits: Visits):
     """Find the motion of what is due in a body without contact, and how far it is from obstacles.
 
     Args:
         threads, thread: Number of threads, and this one.
         first, last: The phases.
-        has_edges: Whether an obstacle can pass between nodes.
-        here: What may touch in this step.
     """
-    surface = rigid.surface
+    surface = visits.rigid.surface
+    here = visits.here
     are_borne = part.shift > 0
     own = part.start + part.shift
     if first == CHOOSE:
@@ -457,15 +429,15 @@ def visit(
                 need = visits.ways[n + part.shift] + visits.needs[n + part.shift]
                 for e in range(surface.bearing.starts[n], surface.bearing.starts[n + 1]):
                     if visits.is_first[0] != 0 or not (visits.until[e] >= need):
-                        choose(surface.bearing.places[e], here, visits)
+                        choose(surface.bearing.places[e], visits)
             else:
-                choose(n, here, visits)
+                choose(n, visits)
     if first <= CARRY and last >= CARRY:
         k = int(thread)
         while k < visits.chosen_count[part.number]:
             s = visits.chosen[part.place + k]
             k += threads
-            carry(s, part, pace, offset, surface, visits)
+            carry(s, part, visits)
     if first <= PLACE and last >= PLACE:
         k = int(thread)
         while k < visits.chosen_count[part.number]:
@@ -473,9 +445,9 @@ def visit(
             k += threads
             if are_borne:
                 find_borne(s, part.nodes, surface)
-            if visits.is_first[0] != 0 and has_edges != 0:
-                visits.spans[s] = longest_edge(s, position_of(s, part, surface, 0.0), 0.0, part, surface, visits)
-            room = room_beside(s, has_edges, part, rigid, watch, visits, here)
+            if visits.is_first[0] != 0 and visits.has_edges != 0:
+                visits.spans[s] = longest_edge(s, position_of(s, part, surface, 0.0), 0.0, part, surface)
+            room = room_beside(s, part, visits)
             b, w = carriers_of(s, surface)
             left = visits.came[0] + room / (wp.abs(w[0]) + wp.abs(w[1]) + wp.abs(w[2]) + wp.abs(w[3]))
             for m in range(4):
@@ -486,12 +458,12 @@ def visit(
     if first <= CORNERS and last >= CORNERS and thread == 0:
         for k in range(here.touch_count[0]):
             for m in range(3):
-                s = visits.triangles[here.touches[k] % visits.triangles.shape[0]][m]
-                if visits.body[s] == part.number and choose(s, here, visits):
-                    carry(s, part, pace, offset, surface, visits)
+                s = surface.triangles[here.touches[k] % surface.triangles.shape[0]][m]
+                if surface.body[s] == part.number and choose(s, visits):
+                    carry(s, part, visits)
                     if are_borne:
                         find_borne(s, part.nodes, surface)
-                if visits.body[s] == part.number and (here.flags[s] & LISTED) == 0:
+                if surface.body[s] == part.number and (here.flags[s] & LISTED) == 0:
                     here.flags[s] = here.flags[s] | LISTED
                     append(here.nodes, 0, here.count, 0, s, visits.is_shared)
     if last == LIMIT and are_borne:
@@ -514,12 +486,10 @@ def end_visits(
     thread: int,
     buffer: int,
     grain: float,
-    visits: Visits,
     counts: int,
-    pace: Pace,
-    offset: int,
-    # In and out
     part: Part,
+    visits: Visits,
+    # In and out
     sums: Sums,
     account: wp.array2d[wp.float64],
     # Out
@@ -532,25 +502,19 @@ def end_visits(
         k += threads
         if sums.touched[n + part.shift] != 0:
             force = take_force(n + part.shift, buffer, grain, sums)
-            push(part.nodes.node[n], force, counts, pace, offset, part.dynamics, account, contact_forces)
+            push(part.nodes.node[n], force, counts, part.pace, part.offset, part.dynamics, account, contact_forces)
 
 
 @wp.kernel(enable_backward=False)
-def complete_triangles(
-    # In
-    pace: Pace,
-    part: Part,
-    visits: Visits,
-    # Out
-    surface: Surface,
-):
+def complete_triangles(part: Part, visits: Visits):
     """Find where the other corners of triangles around places with a force were at the beginning of the last step."""
-    before = float(length_before(pace))
+    before = float(length_before(part.pace))
+    surface = visits.rigid.surface
     for k in range(visits.chosen_count[part.number]):
         s = visits.chosen[part.place + k]
         if wp.length_sq(surface.f[s]) > 0.0:
-            for c in range(visits.corner_starts[s], visits.corner_starts[s + 1]):
-                r = visits.triangles[visits.corners[c] / 3][(visits.corners[c] + 1) % 3]
+            for c in range(surface.corner_starts[s], surface.corner_starts[s + 1]):
+                r = surface.triangles[surface.corners[c] / 3][(surface.corners[c] + 1) % 3]
                 if visits.places[r] != visits.count[0]:
                     b, w = carriers_of(r, surface)
                     x = position_of(r, part, surface, 1.0)

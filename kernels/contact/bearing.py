@@ -12,6 +12,7 @@ import warp as wp
 from warp_corot.kernels.elements.elements import add_force, load_node, store_node
 from warp_corot.kernels.implicit.assembled import Couplings, couple
 from warp_corot.kernels.modules import INLINED
+from warp_corot.kernels.stepping.pace import DT, Pace
 
 from .motion import Foreseen, Surface
 
@@ -225,6 +226,7 @@ def left_at(p: wp.vec4i, w: wp.vec4, gap: float, n: wp.vec3, surface: Surface):
 class Carriers:
     """Carriers of places, [C] = [S + B]; see ``Surface`` and ``Bearing``."""
 
+    surface: Surface
     entry: wp.array[wp.int32]  # of the node in the vectors of the step; -1: unused
     compliance: wp.array[wp.float32]  # of the node alone [m/N]; zero: it is held
     crowd: wp.array2d[wp.float32]  # [2, C] the sum of weights in obstacles that push, and in pairs
@@ -292,9 +294,9 @@ def carriers_of(s: int, surface: Surface):
 
 
 @wp.func
-def motion_at(s: int, surface: Surface, carriers: Carriers, d: wp.array[wp.vec4]):
+def motion_at(s: int, carriers: Carriers, d: wp.array[wp.vec4]):
     """The motion of a place after motions d [m]."""
-    c, w = carriers_of(s, surface)
+    c, w = carriers_of(s, carriers.surface)
     e = wp.vec3()
     for k in range(4):
         if w[k] != 0.0:
@@ -303,9 +305,9 @@ def motion_at(s: int, surface: Surface, carriers: Carriers, d: wp.array[wp.vec4]
 
 
 @wp.func
-def gone_at(s: int, surface: Surface, carriers: Carriers):
+def gone_at(s: int, carriers: Carriers):
     """How far held nodes have moved a place in the step [m]."""
-    c, w = carriers_of(s, surface)
+    c, w = carriers_of(s, carriers.surface)
     e = wp.vec3()
     for k in range(4):
         if w[k] != 0.0:
@@ -314,21 +316,19 @@ def gone_at(s: int, surface: Surface, carriers: Carriers):
 
 
 @wp.func
-def push_at(s: int, force: wp.vec3, surface: Surface, carriers: Carriers, y: wp.array[wp.vec4]):
+def push_at(s: int, force: wp.vec3, carriers: Carriers, y: wp.array[wp.vec4]):
     """Add a force at a place to its carriers that are free [N]."""
-    c, w = carriers_of(s, surface)
+    c, w = carriers_of(s, carriers.surface)
     for k in range(4):
         if w[k] != 0.0 and carriers.compliance[c[k]] > 0.0:
             add_force(y, carriers.entry[c[k]], w[k] * force)
 
 
 @wp.func
-def couple_at(
-    number: int, places: int, s: int, part: wp.vec3, surface: Surface, carriers: Carriers, couplings: Couplings
-):
+def couple_at(number: int, places: int, s: int, part: wp.vec3, carriers: Carriers, couplings: Couplings):
     """Add a place's free carriers to a product of an assembled matrix with this number, which has ``places`` nodes;
     returns how many it has then."""
-    c, w = carriers_of(s, surface)
+    c, w = carriers_of(s, carriers.surface)
     for k in range(4):
         if w[k] != 0.0 and carriers.compliance[c[k]] > 0.0:
             places = couple(number, places, carriers.entry[c[k]], w[k] * part, couplings)
@@ -336,20 +336,20 @@ def couple_at(
 
 
 @wp.func
-def crowd_at(kind: int, s: int, share: float, surface: Surface, carriers: Carriers):
+def crowd_at(kind: int, s: int, share: float, carriers: Carriers):
     """Count a contact that pushes at a place with a share of its force; ``kind``: 1 for pairs, else 0."""
-    c, w = carriers_of(s, surface)
+    c, w = carriers_of(s, carriers.surface)
     for k in range(4):
         if w[k] != 0.0:
             wp.atomic_add(carriers.crowd, kind, c[k], wp.abs(w[k] * share))
 
 
 @wp.func
-def ease_at(kind: int, s: int, share: float, surface: Surface, carriers: Carriers):
+def ease_at(kind: int, s: int, share: float, carriers: Carriers):
     """How far a contact moves with a place that has this share in it, for each unit of force, if all contacts around
     push alike [m/N].
     """
-    c, w = carriers_of(s, surface)
+    c, w = carriers_of(s, carriers.surface)
     total = float(0.0)
     for k in range(4):
         part = wp.abs(share * w[k])
@@ -359,9 +359,9 @@ def ease_at(kind: int, s: int, share: float, surface: Surface, carriers: Carrier
 
 
 @wp.func
-def is_held_at(s: int, surface: Surface, carriers: Carriers):
+def is_held_at(s: int, carriers: Carriers):
     """Whether all carriers of a place are held."""
-    c, w = carriers_of(s, surface)
+    c, w = carriers_of(s, carriers.surface)
     free = bool(False)
     for k in range(4):
         free = free or (w[k] != 0.0 and carriers.compliance[c[k]] > 0.0)
@@ -387,3 +387,54 @@ def end_carriers(start: int, are_bearers: int, nodes: Surface, surface: Surface,
     if are_bearers != 0:
         nodes.f[s] = borne_force(s, surface)
     store_node(contact_forces, i, nodes.f[s])
+
+
+#: What a node has touched is a number of bits: those of ``implicit_rows.mark_acting`` after the last step, and whether
+#: these have changed since the step before.
+CHANGED = wp.constant(1 << 30)
+
+
+@wp.kernel(enable_backward=False)
+def foresee_places(
+    # In
+    start: int,
+    rest: wp.array[wp.vec4],
+    u: wp.array[wp.vec4],
+    v: wp.array[wp.vec4],
+    pace: Pace,
+    touched: wp.array[wp.int32],
+    # Out
+    surface: Surface,
+    begins: wp.array[wp.int32],
+):
+    """Where a body's carriers are, and how far their velocities lead; whether what they touch has changed."""
+    s = start + wp.tid()
+    i = surface.node[s]
+    if i < 0:
+        return
+    home = load_node(rest, i)
+    surface.rest[s] = home
+    surface.x[s] = home + load_node(u, i)
+    surface.d[s] = float(pace.seconds[DT]) * load_node(v, i)
+    if (touched[i] & CHANGED) != 0:
+        begins[0] = 1
+
+
+@wp.kernel(enable_backward=False)
+def note_touched(
+    # In
+    start: int,
+    offset: int,
+    surface: Surface,
+    # In and out
+    marked: wp.array[wp.int32],
+    touched: wp.array[wp.int32],
+):
+    """What the carriers of a body, from ``offset`` on, have touched in the step; none is marked afterwards."""
+    s = start + wp.tid()
+    i = surface.node[s]
+    now = marked[offset + s]
+    marked[offset + s] = 0
+    if i < 0:
+        return
+    touched[i] = now | wp.where(now != (touched[i] & (CHANGED - 1)), CHANGED, 0)

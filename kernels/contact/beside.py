@@ -57,11 +57,10 @@ def find_node(s: int, watch: Watch, rigid: Rigid, near: Near):
 
 
 @wp.func
-def find_triangle(pair: int, watch: Watch, rigid: Rigid, triangles: wp.array[wp.vec3i], near: Near):
+def find_triangle(pair: int, watch: Watch, rigid: Rigid, near: Near):
     """List a triangle that may touch an obstacle before the next search. Obstacles exert no forces on other ones."""
-    o = pair // triangles.shape[0]
-    t = pair % triangles.shape[0]
-    corners = triangles[t]
+    o = pair // rigid.surface.triangles.shape[0]
+    corners = rigid.surface.triangles[pair % rigid.surface.triangles.shape[0]]
     if rigid.shapes.kind[o] != GROUND and corners[0] >= 0:
         world = rigid.surface.world[corners[0]]
         a = rigid.surface.x[corners[0]]
@@ -95,7 +94,6 @@ def search_near(
     last: int,
     asks: int,
     sleeps: int,
-    triangles: wp.array[wp.vec3i],
     # In and out
     rigid: Rigid,
     watch: Watch,
@@ -148,7 +146,7 @@ def search_near(
                 if k < places:
                     find_node(k, watch, rigid, near)
                 else:
-                    find_triangle(k - places, watch, rigid, triangles, near)
+                    find_triangle(k - places, watch, rigid, near)
                 k += threads
         elif thread == 0:
             end_search(sleeps, near, watch)

@@ -1,9 +1,9 @@
 """Closest points of triangles: to a point, to a segment, and to any obstacle that has a signed distance.
 
-In an implicit step the closest point rolls around a round obstacle; see ``obstacle_rows``. A triangle that tilts by the
-gradient s of its corners' motions along the normal, and slides by t there, is closest to a sphere elsewhere, and the
-force f turns it back. To second order its gap is g - s . t + D s . s / 2, where D is the distance from the centre. The
-part f D q . q / 2 of the energy with q = s - t / D is convex. Without it in the matrix, closest points and tilts
+In an implicit step the closest point rolls around a round obstacle; see ``implicit_location``. A triangle that tilts
+by the gradient s of its corners' motions along the normal, and slides by t there, is closest to a sphere elsewhere, and
+the force f turns it back. To second order its gap is g - s . t + D s . s / 2, where D is the distance from the centre.
+The part f D q . q / 2 of the energy with q = s - t / D is convex. Without it in the matrix, closest points and tilts
 alternate from solve to solve wherever f D over the square of an edge is more than the stiffness of the body. The rest,
 - f t . t / 2 D, is left to the search for closest points.
 """

@@ -30,8 +30,6 @@ class Rigid:
     first_triangle: int  # the first row of a triangle, O S
     anchors: wp.array[wp.vec4]  # [O S] in the obstacle's frame; the fourth number is 1 if the place sticks
     allowance: wp.array[wp.float32]  # [R] how deep the place or triangle may be [m]; see ``law.allowed``
-    # [T] fraction of the last step's normal force on a triangle that is left beside corners that touch
-    warmth: wp.array[wp.float32]
 
 
 @wp.func
@@ -185,13 +183,13 @@ def near_triangle(
 
 
 @wp.func
-def find_touch(r: int, rigid: Rigid, triangles: wp.array[wp.vec3i]):
+def find_touch(r: int, rigid: Rigid):
     """Find the point where an obstacle comes close to a triangle but not to its corners, and the force with which the
     step begins. Returns whether there is one.
     """
     rows = rigid.rows
-    o = (r - rigid.first_triangle) // triangles.shape[0]
-    t = (r - rigid.first_triangle) % triangles.shape[0]
+    o = (r - rigid.first_triangle) // rigid.surface.triangles.shape[0]
+    t = (r - rigid.first_triangle) % rigid.surface.triangles.shape[0]
     was = rows.force[r]
     # Most triangles that something is near have no contact: these are only read.
     if wp.length_sq(rows.weights[r]) > 0.0 or wp.dot(was, was) > 0.0:
@@ -199,7 +197,7 @@ def find_touch(r: int, rigid: Rigid, triangles: wp.array[wp.vec3i]):
         rows.force[r] = wp.vec3()
         rows.more[r] = wp.vec3()
         rows.acts[r] = 0
-    corners = triangles[t]
+    corners = rigid.surface.triangles[t]
     pose = rigid.motions.now[rigid.surface.world[corners[0]], o]
     later = rigid.motions.later[rigid.surface.world[corners[0]], o]
     a = rigid.surface.x[corners[0]]
@@ -232,7 +230,7 @@ def find_touch(r: int, rigid: Rigid, triangles: wp.array[wp.vec3i]):
     for k in range(3):
         at = rigid.anchors[o * rigid.surface.node.shape[0] + corners[k]]
         if at[3] > 0.0 or is_borne(corners[k], rigid.surface):
-            push = rigid.warmth[t] * was_push
+            push = rigid.surface.warmth[t] * was_push
     # Friction begins with all of it, because the slip that restores a part would accumulate.
     if push > 0.0:
         rows.force[r] = push * n + held_back(across(was, n), was_push, friction)

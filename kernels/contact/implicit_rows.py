@@ -3,7 +3,7 @@
 A row is an obstacle at a place, an obstacle at a triangle, or a pair of soft surfaces: up to four places with weights,
 whose weighted motion opens it. Nodes bear a place, or it is a node itself. See ``law`` for a row's force, with a
 stiffness like that of the nodes around it. Each time the step has been solved for, rows are located again and their
-forces become their multipliers; see ``obstacle_rows`` and ``pair_rows``. While the step is solved for, a row stays what
+forces become their multipliers; see ``implicit_location``. While the step is solved for, a row stays what
 it was located as, a plane that nothing passes.
 """
 
@@ -12,6 +12,7 @@ import warp as wp
 from warp_corot.kernels.elements.elements import load_node, store_node
 from warp_corot.kernels.implicit.assembled import Couplings, add_block, begin_coupling, end_coupling, root_columns
 from warp_corot.kernels.implicit.line_search import TRIED
+from warp_corot.kernels.modules import WITHOUT_COPIES
 
 from .bearing import (
     Carriers,
@@ -29,7 +30,7 @@ from .law import bound_of, spring_state
 from .motion import Surface
 from .rows import Rows, row_count
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": WITHOUT_COPIES})
 
 #: Lists of rows: obstacles and pairs that may meet, as they were located; those that push; and those that push before
 #: or after a change of the motions.
@@ -50,6 +51,7 @@ mat43 = wp.types.matrix(shape=(4, 3), dtype=wp.float32)
 class ImplicitRows:
     """Contacts, [R]. Numbers: S for each obstacle, then T for each obstacle, and then the pairs."""
 
+    carriers: Carriers
     first_triangle: int  # the first number of a triangle
     first_pair: int  # the first number of a pair
     places: wp.array[wp.vec4i]  # -1 for none
@@ -108,13 +110,12 @@ def list_row(r: int, rows: ImplicitRows):
 
 
 @wp.kernel(enable_backward=False)
-def begin_location(
-    which: int, d: wp.array[wp.vec4], surface: Surface, located: Surface, carriers: Carriers, rows: ImplicitRows
-):
+def begin_location(which: int, d: wp.array[wp.vec4], located: Surface, rows: ImplicitRows):
     """Begin to locate rows, if that is due: forget those that were near, and put the places of pairs where the step
     begins, or after motions d; a thread for each carrier."""
     c = wp.tid()
-    places = surface.node.shape[0]
+    carriers = rows.carriers
+    surface = carriers.surface
     if which == FIRST or (which == AGAIN and rows.due[0] != 0):
         carriers.crowd[0, c] = 0.0
         if c == 0:
@@ -124,10 +125,10 @@ def begin_location(
         carriers.crowd[1, c] = 0.0
         if c == 0:
             rows.counts[PAIRS] = 0
-        if c < places and c < located.x.shape[0] and surface.node[c] >= 0:
+        if c < located.x.shape[0] and surface.node[c] >= 0:
             x = surface.x[c]
             if which == AGAIN:
-                x += motion_at(c, surface, carriers, d)
+                x += motion_at(c, rows.carriers, d)
             located.x[c] = x
 
 
@@ -135,7 +136,7 @@ def begin_location(
 
 
 @wp.func
-def opened_by(r: int, d: wp.array[wp.vec4], rows: ImplicitRows, surface: Surface, carriers: Carriers):
+def opened_by(r: int, d: wp.array[wp.vec4], rows: ImplicitRows):
     """How much farther apart the two sides are after motions d of the nodes [m]."""
     p = rows.places[r]
     w = rows.weights[r]
@@ -144,7 +145,7 @@ def opened_by(r: int, d: wp.array[wp.vec4], rows: ImplicitRows, surface: Surface
     k = int(0)
     while k < 4:
         if w[k] != 0.0:
-            e += w[k] * motion_at(p[k], surface, carriers, d)
+            e += w[k] * motion_at(p[k], rows.carriers, d)
         k += 1
     return e
 
@@ -159,15 +160,13 @@ def row_state(r: int, e: wp.vec3, most: float, rows: ImplicitRows):
 
 
 @wp.func
-def add_to_places(
-    r: int, force: wp.vec3, rows: ImplicitRows, surface: Surface, carriers: Carriers, y: wp.array[wp.vec4]
-):
+def add_to_places(r: int, force: wp.vec3, rows: ImplicitRows, y: wp.array[wp.vec4]):
     p = rows.places[r]
     w = rows.weights[r]
     k = int(0)
     while k < 4:
         if w[k] != 0.0:
-            push_at(p[k], w[k] * force, surface, carriers, y)
+            push_at(p[k], w[k] * force, rows.carriers, y)
         k += 1
 
 
@@ -186,11 +185,11 @@ def corner_weights(r: int, rows: ImplicitRows):
 
 
 @wp.func
-def tilt_of(r: int, d: wp.array[wp.vec4], rows: ImplicitRows, surface: Surface, carriers: Carriers):
+def tilt_of(r: int, d: wp.array[wp.vec4], rows: ImplicitRows):
     """The tilt of a triangle after motions d."""
     e = wp.mat33()
     for k in range(3):
-        e[k] = motion_at(rows.places[r][k], surface, carriers, d)
+        e[k] = motion_at(rows.places[r][k], rows.carriers, d)
     return tilted(rows.rolling[r - rows.first_triangle], corner_weights(r, rows), rows.normal[r], e)
 
 
@@ -201,19 +200,17 @@ def moment_at(r: int, k: int, m: wp.vec3, rows: ImplicitRows):
 
 
 @wp.func
-def push_corners(r: int, m: wp.vec3, rows: ImplicitRows, surface: Surface, carriers: Carriers, y: wp.array[wp.vec4]):
+def push_corners(r: int, m: wp.vec3, rows: ImplicitRows, y: wp.array[wp.vec4]):
     """Add the forces of a moment against tilting."""
     for k in range(3):
-        push_at(rows.places[r][k], moment_at(r, k, m, rows), surface, carriers, y)
+        push_at(rows.places[r][k], moment_at(r, k, m, rows), rows.carriers, y)
 
 
 # --- all rows --------------------------------------------------------------------------------------------------------
 
 
 @wp.kernel(enable_backward=False)
-def stiffen_rows(
-    threads: int, which: int, changed: wp.array[wp.int32], surface: Surface, carriers: Carriers, rows: ImplicitRows
-):
+def stiffen_rows(threads: int, which: int, changed: wp.array[wp.int32], rows: ImplicitRows):
     """Stiffness of rows that have been located: those that share nodes share it. A row whose nodes are all held does
     nothing.
 
@@ -234,18 +231,16 @@ def stiffen_rows(
         m = int(0)
         while m < 4:
             if w[m] != 0.0:
-                yielding += ease_at(of_pairs, p[m], w[m], surface, carriers)
+                yielding += ease_at(of_pairs, p[m], w[m], rows.carriers)
             m += 1
         stiff = wp.where(of_pairs != 0, STIFF_PAIR, STIFF)
-        part = loose_part(loose_at(p, w, surface))
+        part = loose_part(loose_at(p, w, rows.carriers.surface))
         rows.stiffness[r] = wp.where(yielding > 0.0, part * stiff / yielding, 0.0)
         k += threads
 
 
 @wp.kernel(enable_backward=False)
-def update_rows(
-    threads: int, is_solved: int, d: wp.array[wp.vec4], surface: Surface, carriers: Carriers, rows: ImplicitRows
-):
+def update_rows(threads: int, is_solved: int, d: wp.array[wp.vec4], rows: ImplicitRows):
     """Forces and derivatives after motions d, with the friction that the push there allows, and the rows that push,
     whose list the launch before has emptied.
 
@@ -256,7 +251,7 @@ def update_rows(
         rows.counts[REACHED] = 0
     while k < near_count(rows):
         r = near_row(k, rows)
-        e = opened_by(r, d, rows, surface, carriers)
+        e = opened_by(r, d, rows)
         push = row_state(r, e, 0.0, rows).push
         most = bound_of(rows.most[r], push, rows.friction[r], is_solved != 0, rows.solves[0])
         rows.most[r] = most
@@ -269,7 +264,7 @@ def update_rows(
         bend = bend_of(r, rows)
         if bend > 0.0:
             t = r - rows.first_triangle
-            rows.moment[t] = bend * (rows.tilt[t] - tilt_of(r, d, rows, surface, carriers))
+            rows.moment[t] = bend * (rows.tilt[t] - tilt_of(r, d, rows))
         if push > 0.0 or bend > 0.0:
             rows.pushing[wp.atomic_add(rows.counts, PUSHING, 1)] = r
         k += threads
@@ -280,8 +275,6 @@ def find_reached(
     threads: int,
     d: wp.array[wp.vec4],
     change: wp.array[wp.vec4],
-    surface: Surface,
-    carriers: Carriers,
     rows: ImplicitRows,
 ):
     """The rows that push after motions d or with the change: as gaps change in proportion, no others push between."""
@@ -290,8 +283,8 @@ def find_reached(
         rows.counts[PUSHING] = 0
     while k < near_count(rows):
         r = near_row(k, rows)
-        e = opened_by(r, d, rows, surface, carriers)
-        after = e + opened_by(r, change, rows, surface, carriers)
+        e = opened_by(r, d, rows)
+        after = e + opened_by(r, change, rows)
         push = wp.max(row_state(r, e, 0.0, rows).push, row_state(r, after, 0.0, rows).push)
         if push > 0.0 or bend_of(r, rows) > 0.0:
             rows.reached[wp.atomic_add(rows.counts, REACHED, 1)] = r
@@ -299,14 +292,14 @@ def find_reached(
 
 
 @wp.kernel(enable_backward=False)
-def add_row_forces(threads: int, surface: Surface, carriers: Carriers, rows: ImplicitRows, y: wp.array[wp.vec4]):
+def add_row_forces(threads: int, rows: ImplicitRows, y: wp.array[wp.vec4]):
     """Add the forces of rows on nodes that are free [N]."""
     k = wp.tid()
     while k < rows.counts[PUSHING]:
         r = rows.pushing[k]
-        add_to_places(r, rows.force[r], rows, surface, carriers, y)
+        add_to_places(r, rows.force[r], rows, y)
         if bend_of(r, rows) > 0.0:
-            push_corners(r, rows.moment[r - rows.first_triangle], rows, surface, carriers, y)
+            push_corners(r, rows.moment[r - rows.first_triangle], rows, y)
         k += threads
 
 
@@ -314,8 +307,6 @@ def add_row_forces(threads: int, surface: Surface, carriers: Carriers, rows: Imp
 def add_row_products(
     # In
     threads: int,
-    surface: Surface,
-    carriers: Carriers,
     rows: ImplicitRows,
     x: wp.array[wp.vec4],
     # Out
@@ -325,16 +316,16 @@ def add_row_products(
     k = wp.tid()
     while k < rows.counts[PUSHING]:
         r = rows.pushing[k]
-        product = rows.derivative[r] * opened_by(r, x, rows, surface, carriers)
-        add_to_places(r, product, rows, surface, carriers, y)
+        product = rows.derivative[r] * opened_by(r, x, rows)
+        add_to_places(r, product, rows, y)
         bend = bend_of(r, rows)
         if bend > 0.0:
-            push_corners(r, bend * tilt_of(r, x, rows, surface, carriers), rows, surface, carriers, y)
+            push_corners(r, bend * tilt_of(r, x, rows), rows, y)
         k += threads
 
 
 @wp.func
-def couple_parts(parts: mat43, r: int, rows: ImplicitRows, surface: Surface, carriers: Carriers, to: Couplings):
+def couple_parts(parts: mat43, r: int, rows: ImplicitRows, to: Couplings):
     """Add c c^T to a matrix, with the rows of ``parts`` as c at a row's places."""
     c = begin_coupling(to)
     if c < 0:
@@ -343,7 +334,7 @@ def couple_parts(parts: mat43, r: int, rows: ImplicitRows, surface: Surface, car
     k = int(0)
     while k < 4:
         if wp.length_sq(parts[k]) > 0.0:
-            places = couple_at(c, places, rows.places[r][k], parts[k], surface, carriers, to)
+            places = couple_at(c, places, rows.places[r][k], parts[k], rows.carriers, to)
         k += 1
     end_coupling(c, places, to)
 
@@ -352,8 +343,6 @@ def couple_parts(parts: mat43, r: int, rows: ImplicitRows, surface: Surface, car
 def couple_rows(
     # In
     threads: int,
-    surface: Surface,
-    carriers: Carriers,
     rows: ImplicitRows,
     # In and out
     couplings: Couplings,
@@ -364,15 +353,15 @@ def couple_rows(
         r = rows.pushing[i]
         w = rows.weights[r]
         s = rows.places[r][0]
-        if r < rows.first_triangle and not is_borne(s, surface):
-            if carriers.compliance[s] > 0.0:
-                add_block(carriers.entry[s], rows.derivative[r], couplings)
+        if r < rows.first_triangle and not is_borne(s, rows.carriers.surface):
+            if rows.carriers.compliance[s] > 0.0:
+                add_block(rows.carriers.entry[s], rows.derivative[r], couplings)
         else:
             roots = root_columns(rows.derivative[r])
             for axis in range(3):
                 g = wp.vec3(roots[0, axis], roots[1, axis], roots[2, axis])
                 if wp.length_sq(g) > 0.0:
-                    couple_parts(wp.outer(w, g), r, rows, surface, carriers, couplings)
+                    couple_parts(wp.outer(w, g), r, rows, couplings)
         bend = bend_of(r, rows)
         if bend > 0.0:
             along = rows.rolling[r - rows.first_triangle].along
@@ -385,7 +374,7 @@ def couple_rows(
                 parts = mat43()
                 for k in range(3):
                     parts[k] = moment_at(r, k, m, rows)
-                couple_parts(parts, r, rows, surface, carriers, couplings)
+                couple_parts(parts, r, rows, couplings)
         i += threads
 
 
@@ -395,8 +384,6 @@ def add_row_slopes(
     threads: int,
     only_world: int,
     apart: int,
-    surface: Surface,
-    carriers: Carriers,
     rows: ImplicitRows,
     d: wp.array[wp.vec4],
     change: wp.array[wp.vec4],
@@ -415,15 +402,15 @@ def add_row_slopes(
     while k < rows.counts[REACHED]:
         r = rows.reached[k]
         s = rows.places[r][0]
-        world = wp.where(only_world != 0, 0, surface.world[s])
+        world = wp.where(only_world != 0, 0, rows.carriers.surface.world[s])
         share = float(search[world, TRIED])
-        along = opened_by(r, change, rows, surface, carriers)
-        e = opened_by(r, d, rows, surface, carriers) + share * along
+        along = opened_by(r, change, rows)
+        e = opened_by(r, d, rows) + share * along
         power = wp.dot(wp.vec3d(row_state(r, e, rows.most[r], rows).force), wp.vec3d(along))
         bend = bend_of(r, rows)
         if bend > 0.0:
-            tilts = tilt_of(r, change, rows, surface, carriers)
-            tilt = tilt_of(r, d, rows, surface, carriers) + share * tilts - rows.tilt[r - rows.first_triangle]
+            tilts = tilt_of(r, change, rows)
+            tilt = tilt_of(r, d, rows) + share * tilts - rows.tilt[r - rows.first_triangle]
             power -= wp.float64(bend) * wp.dot(wp.vec3d(tilt), wp.vec3d(tilts))
         if only_world != 0 and apart < 0:
             total += power
@@ -483,7 +470,6 @@ def scale_nodes(
     start: int,
     first: int,
     is_after: int,
-    surface: Surface,
     carriers: Carriers,
     stiffness: wp.array[wp.mat33],
     v: wp.array[wp.vec4],
@@ -494,7 +480,7 @@ def scale_nodes(
     The vector v has the entries of one body, the first of which is entry ``first`` in vectors of all bodies.
     """
     s = start + wp.tid()
-    if surface.node[s] < 0 or is_borne(s, surface) or wp.trace(stiffness[s]) <= 0.0:
+    if carriers.surface.node[s] < 0 or is_borne(s, carriers.surface) or wp.trace(stiffness[s]) <= 0.0:
         return
     g = root_columns(wp.inverse(wp.identity(n=3, dtype=float) + carriers.compliance[s] * stiffness[s]))
     i = carriers.entry[s] - first
@@ -561,18 +547,19 @@ def end_rows(
 
 
 @wp.kernel(enable_backward=False)
-def end_places(d: wp.array[wp.vec4], carriers: Carriers, added: wp.array[wp.vec3], surface: Surface):
+def end_places(d: wp.array[wp.vec4], added: wp.array[wp.vec3], carriers: Carriers):
     """What has come of the step at the places: motions and forces."""
     s = wp.tid()
+    surface = carriers.surface
     if surface.node[s] < 0:
         return
-    surface.d[s] = motion_at(s, surface, carriers, d)
+    surface.d[s] = motion_at(s, carriers, d)
     surface.f[s] = added[s]
     added[s] = wp.vec3()
 
 
 @wp.kernel(enable_backward=False)
-def mark_acting(threads: int, obstacles: int, surface: Surface, rows: ImplicitRows, marked: wp.array[wp.int32]):
+def mark_acting(threads: int, obstacles: int, rows: ImplicitRows, marked: wp.array[wp.int32]):
     """Mark the carriers of the places of rows that push: each obstacle has a bit, and pairs together."""
     k = wp.tid()
     while k < near_count(rows):
@@ -585,5 +572,5 @@ def mark_acting(threads: int, obstacles: int, surface: Surface, rows: ImplicitRo
                 bit = ((r - rows.first_triangle) / ((rows.first_pair - rows.first_triangle) / obstacles)) % BY_PAIR
             for m in range(4):
                 if rows.weights[r][m] != 0.0:
-                    mark_carriers(rows.places[r][m], wp.lshift(1, bit), surface, marked)
+                    mark_carriers(rows.places[r][m], wp.lshift(1, bit), rows.carriers.surface, marked)
         k += threads

@@ -7,7 +7,7 @@ from .closest import on_segments, on_triangle, point_of
 from .explicit_rows import FORESEEN, WAITS
 from .law import Law, across, held_back
 from .motion import Surface
-from .rows import BAND, BAND_AT_REST, BAND_OF_NEIGHBOURS, Meeting, Rows, triangle_normal
+from .rows import BAND, BAND_AT_REST, BAND_OF_NEIGHBOURS, Rows, triangle_normal
 
 wp.set_module_options({"enable_backward": False})
 
@@ -40,10 +40,10 @@ def firm_normal(surface: Surface, c: wp.vec3i):
 
 
 @wp.func
-def edge_normal(surface: Surface, meeting: Meeting, e: int):
-    sides = meeting.sides[e]
-    first = triangle_normal(surface, meeting.triangles[sides[0]])
-    second = triangle_normal(surface, meeting.triangles[sides[1]])
+def edge_normal(surface: Surface, e: int):
+    sides = surface.sides[e]
+    first = triangle_normal(surface, surface.triangles[sides[0]])
+    second = triangle_normal(surface, surface.triangles[sides[1]])
     return wp.normalize(first + second)
 
 
@@ -73,38 +73,38 @@ def face_at_rest(out: wp.vec3, n: wp.vec3, apart: wp.vec3):
 
 
 @wp.func
-def node_faces_at_rest(s: int, c: wp.vec3i, apart: wp.vec3, surface: Surface, meeting: Meeting):
+def node_faces_at_rest(s: int, c: wp.vec3i, apart: wp.vec3, surface: Surface):
     out = wp.vec3()
-    for k in range(meeting.corner_starts[s], meeting.corner_starts[s + 1]):
-        out += rest_normal(surface, meeting.triangles[meeting.corners[k] / 3])
+    for k in range(surface.corner_starts[s], surface.corner_starts[s + 1]):
+        out += rest_normal(surface, surface.triangles[surface.corners[k] / 3])
     return face_at_rest(out, rest_normal(surface, c), apart)
 
 
 @wp.func
-def rest_edge_normal(e: int, surface: Surface, meeting: Meeting):
-    sides = meeting.sides[e]
-    first = rest_normal(surface, meeting.triangles[sides[0]])
-    return first + rest_normal(surface, meeting.triangles[sides[1]])
+def rest_edge_normal(e: int, surface: Surface):
+    sides = surface.sides[e]
+    first = rest_normal(surface, surface.triangles[sides[0]])
+    return first + rest_normal(surface, surface.triangles[sides[1]])
 
 
 @wp.func
-def are_neighbours(s: int, c: wp.vec3i, meeting: Meeting):
+def are_neighbours(s: int, c: wp.vec3i, surface: Surface):
     """Whether an edge of the surface leads from a node to a corner of a triangle."""
-    for k in range(meeting.corner_starts[s], meeting.corner_starts[s + 1]):
-        q = meeting.triangles[meeting.corners[k] / 3][(meeting.corners[k] + 1) % 3]
+    for k in range(surface.corner_starts[s], surface.corner_starts[s + 1]):
+        q = surface.triangles[surface.corners[k] / 3][(surface.corners[k] + 1) % 3]
         if q == c[0] or q == c[1] or q == c[2]:
             return True
     return False
 
 
 @wp.func
-def faces(s: int, n: wp.vec3, surface: Surface, meeting: Meeting):
+def faces(s: int, n: wp.vec3, surface: Surface):
     """Whether a surface with the normal n is one that a node may touch: one of the faces around the node, or all
     together, must face it.
     """
     out = wp.vec3()
-    for k in range(meeting.corner_starts[s], meeting.corner_starts[s + 1]):
-        each = firm_normal(surface, meeting.triangles[meeting.corners[k] / 3])
+    for k in range(surface.corner_starts[s], surface.corner_starts[s + 1]):
+        each = firm_normal(surface, surface.triangles[surface.corners[k] / 3])
         if wp.dot(each, n) < FACING:
             return True
         out += each
@@ -112,9 +112,7 @@ def faces(s: int, n: wp.vec3, surface: Surface, meeting: Meeting):
 
 
 @wp.func
-def is_nearer_to_a_side(
-    s: int, t: int, w: wp.vec3, n: wp.vec3, depth: float, size: float, surface: Surface, meeting: Meeting
-):
+def is_nearer_to_a_side(s: int, t: int, w: wp.vec3, n: wp.vec3, depth: float, size: float, surface: Surface):
     """Whether a node that is behind a triangle has a shorter way out over a sharp side of it, where another triangle
     takes it: one that the node faces and is behind. So a bar on the rim of a block is not pushed off its side.
 
@@ -124,21 +122,21 @@ def is_nearer_to_a_side(
         depth: How far behind it the node is [m].
         size: Root of twice its area [m].
     """
-    c = meeting.triangles[t]
+    c = surface.triangles[t]
     for k in range(3):
         i = c[(k + 1) % 3]
         j = c[(k + 2) % 3]
         side = wp.length(surface.x[j] - surface.x[i])
         if depth * side > w[k] * size * size:
-            for m in range(meeting.corner_starts[i], meeting.corner_starts[i + 1]):
-                other = meeting.corners[m] / 3
-                d = meeting.triangles[other]
+            for m in range(surface.corner_starts[i], surface.corner_starts[i + 1]):
+                other = surface.corners[m] / 3
+                d = surface.triangles[other]
                 if other != t and (d[0] == j or d[1] == j or d[2] == j):
                     beside = triangle_normal(surface, d)
                     middle = (surface.x[d[0]] + surface.x[d[1]] + surface.x[d[2]]) / 3.0
                     is_sharp = wp.dot(beside, n) < -FACING and wp.dot(middle - surface.x[i], n) < 0.0
                     below = -wp.dot(surface.x[s] - surface.x[i], beside)
-                    if is_sharp and below > 0.0 and below < depth and faces(s, beside, surface, meeting):
+                    if is_sharp and below > 0.0 and below < depth and faces(s, beside, surface):
                         v = on_triangle(surface.x[s], surface.x[d[0]], surface.x[d[1]], surface.x[d[2]])
                         if wp.min(v) > 0.0:
                             return True
@@ -146,9 +144,9 @@ def is_nearer_to_a_side(
 
 
 @wp.func
-def locate_node(row: int, s: int, t: int, surface: Surface, meeting: Meeting, rows: Rows):
+def locate_node(row: int, s: int, t: int, surface: Surface, rows: Rows):
     """A node at a triangle."""
-    c = meeting.triangles[t]
+    c = surface.triangles[t]
     a = surface.x[c[0]]
     b = surface.x[c[1]]
     e = surface.x[c[2]]
@@ -164,31 +162,31 @@ def locate_node(row: int, s: int, t: int, surface: Surface, meeting: Meeting, ro
             return False
         n = way / length
         gap = length
-        if not faces(s, n, surface, meeting):
+        if not faces(s, n, surface):
             return False
     # Points of own surfaces may not be at the other triangle, because several share the nodes that bear them.
-    if gap < 0.0 and not is_borne(s, surface) and is_nearer_to_a_side(s, t, w, n, -gap, size, surface, meeting):
+    if gap < 0.0 and not is_borne(s, surface) and is_nearer_to_a_side(s, t, w, n, -gap, size, surface):
         return False
     rows.places[row] = wp.vec4i(s, c[0], c[1], c[2])
     rows.weights[row] = wp.vec4(1.0, -w[0], -w[1], -w[2])
     rows.normal[row] = n
     rows.gap[row] = gap
-    is_self = meeting.body[s] == meeting.body[c[0]]
+    is_self = surface.body[s] == surface.body[c[0]]
     apart = wp.vec3()
     if is_self:
         apart = surface.rest[s] - point_of(w, surface.rest[c[0]], surface.rest[c[1]], surface.rest[c[2]])
-    if is_self and gap < -BAND_OF_NEIGHBOURS * wp.length(apart) and are_neighbours(s, c, meeting):
+    if is_self and gap < -BAND_OF_NEIGHBOURS * wp.length(apart) and are_neighbours(s, c, surface):
         return False
     if gap > deepest(size, is_self, apart):
         return True
-    return gap > -BAND * size and node_faces_at_rest(s, c, apart, surface, meeting)
+    return gap > -BAND * size and node_faces_at_rest(s, c, apart, surface)
 
 
 @wp.func
-def locate_edge(row: int, first: int, second: int, surface: Surface, meeting: Meeting, rows: Rows):
+def locate_edge(row: int, first: int, second: int, surface: Surface, rows: Rows):
     """Two edges that cross."""
-    f = meeting.edges[first]
-    g = meeting.edges[second]
+    f = surface.edges[first]
+    g = surface.edges[second]
     p = surface.x[f[0]]
     q = surface.x[f[1]]
     a = surface.x[g[0]]
@@ -202,8 +200,8 @@ def locate_edge(row: int, first: int, second: int, surface: Surface, meeting: Me
     if length < PARALLEL * wp.length(q - p) * wp.length(b - a):
         return False
     n = n / length
-    out_of_first = edge_normal(surface, meeting, first)
-    out_of_second = edge_normal(surface, meeting, second)
+    out_of_first = edge_normal(surface, first)
+    out_of_second = edge_normal(surface, second)
     if wp.dot(n, out_of_second - out_of_first) < 0.0:
         n = -n
     # The normal points out of the second body and into the first; other pairs face each other elsewhere.
@@ -214,7 +212,7 @@ def locate_edge(row: int, first: int, second: int, surface: Surface, meeting: Me
     to_ends = wp.min(wp.min(s, 1.0 - s) * wp.length(q - p), wp.min(t, 1.0 - t) * wp.length(b - a))
     if gap < -to_ends:
         return False
-    is_self = meeting.body[f[0]] == meeting.body[g[0]]
+    is_self = surface.body[f[0]] == surface.body[g[0]]
     apart = wp.vec3()
     if is_self:
         apart = surface.rest[f[0]] + s * (surface.rest[f[1]] - surface.rest[f[0]])
@@ -227,8 +225,8 @@ def locate_edge(row: int, first: int, second: int, surface: Surface, meeting: Me
         return True
     if gap <= -BAND * size:
         return False
-    out = rest_edge_normal(first, surface, meeting)
-    return face_at_rest(out, rest_edge_normal(second, surface, meeting), apart)
+    out = rest_edge_normal(first, surface)
+    return face_at_rest(out, rest_edge_normal(second, surface), apart)
 
 
 #: The largest cosine between the way to a node beyond a triangle's border and the next triangle.
@@ -236,25 +234,25 @@ LEANING = wp.constant(0.1)
 
 
 @wp.func
-def is_faced(row: int, s: int, surface: Surface, meeting: Meeting, rows: Rows):
+def is_faced(row: int, s: int, surface: Surface, rows: Rows):
     """Whether the normal of a node at a triangle points into the node's body: otherwise the two face each other
     elsewhere. At a rim, where two faces meet, a node need not be above both.
     """
     out = wp.vec3()
-    for k in range(meeting.corner_starts[s], meeting.corner_starts[s + 1]):
-        out += firm_normal(surface, meeting.triangles[meeting.corners[k] / 3])
+    for k in range(surface.corner_starts[s], surface.corner_starts[s + 1]):
+        out += firm_normal(surface, surface.triangles[surface.corners[k] / 3])
     return wp.dot(out, rows.normal[row]) <= -ACROSS * wp.length(out)
 
 
 @wp.func
-def leans_over(row: int, surface: Surface, meeting: Meeting, rows: Rows):
+def leans_over(row: int, surface: Surface, rows: Rows):
     """Whether the way from the border of a triangle to a node leads over a neighbour of the triangle.
 
     Then the neighbour is closer, and its own pair counts. A plane across that way would hold back what slides over both
     triangles.
     """
     t = rows.other[row]
-    c = meeting.triangles[t]
+    c = surface.triangles[t]
     share = rows.weights[row]
     first = int(-1)
     last = int(-1)
@@ -270,10 +268,10 @@ def leans_over(row: int, surface: Surface, meeting: Meeting, rows: Rows):
     if corners == 3 or first < 0:
         return False
     n = rows.normal[row]
-    for k in range(meeting.corner_starts[first], meeting.corner_starts[first + 1]):
-        at = meeting.corners[k] % 3
-        other = meeting.corners[k] / 3
-        e = meeting.triangles[other]
+    for k in range(surface.corner_starts[first], surface.corner_starts[first + 1]):
+        at = surface.corners[k] % 3
+        other = surface.corners[k] / 3
+        e = surface.triangles[other]
         q = e[(at + 1) % 3]
         if corners == 2:
             r = e[(at + 2) % 3]
@@ -289,20 +287,20 @@ def leans_over(row: int, surface: Surface, meeting: Meeting, rows: Rows):
 
 
 @wp.func
-def locate_facing(row: int, surface: Surface, meeting: Meeting, rows: Rows) -> bool:
+def locate_facing(row: int, surface: Surface, rows: Rows) -> bool:
     """The closest points of a pair; whether it may touch."""
-    nodes = meeting.body.shape[0]
+    nodes = surface.node.shape[0]
     owner = rows.owner[row]
     if owner >= nodes:
-        return locate_edge(row, owner - nodes, rows.other[row], surface, meeting, rows)
-    if owner < 0 or not locate_node(row, owner, rows.other[row], surface, meeting, rows):
+        return locate_edge(row, owner - nodes, rows.other[row], surface, rows)
+    if owner < 0 or not locate_node(row, owner, rows.other[row], surface, rows):
         return False
-    if not is_faced(row, owner, surface, meeting, rows):
+    if not is_faced(row, owner, surface, rows):
         return False
     # Within a body, such pairs hold back parts of it that close on one another at rims.
-    if meeting.body[owner] == meeting.body[meeting.triangles[rows.other[row]][0]]:
+    if surface.body[owner] == surface.body[surface.triangles[rows.other[row]][0]]:
         return True
-    return not leans_over(row, surface, meeting, rows)
+    return not leans_over(row, surface, rows)
 
 
 # --- pairs of an explicit step ----------------------------------------------------------------------------------------
@@ -327,19 +325,19 @@ def list_by_warp(live: wp.array[wp.int32], count: wp.array[wp.int32], row: int, 
 
 
 @wp.func
-def is_apart(row: int, law: Law, surface: Surface, meeting: Meeting, rows: Rows):
+def is_apart(row: int, law: Law, surface: Surface, searched: wp.array[wp.vec3], rows: Rows):
     """Whether a pair without a force cannot touch in this step: the relative motion of its places has not used up the
     distance that was between them at the last search."""
     owner = rows.owner[row]
     if rows.acts[row] > WAITS or owner < 0:
         return owner < 0
     p = rows.places[row]
-    first = wp.where(owner < meeting.body.shape[0], 1, 2)
+    first = wp.where(owner < surface.node.shape[0], 1, 2)
     most = float(0.0)
     for k in range(2):
         for m in range(1, 4):
             if k < first and m >= first:
-                gone = surface.x[p[k]] - meeting.searched[p[k]] - surface.x[p[m]] + meeting.searched[p[m]]
+                gone = surface.x[p[k]] - searched[p[k]] - surface.x[p[m]] + searched[p[m]]
                 most = wp.max(most, wp.length(gone) + FORESEEN * wp.length(surface.d[p[k]] - surface.d[p[m]]))
     return ROUNDED * most + law.closing < rows.away[row]
 
@@ -366,15 +364,15 @@ def may_push(row: int, law: Law, surface: Surface, rows: Rows):
 
 
 @wp.func
-def locate_row(row: int, law: Law, surface: Surface, meeting: Meeting, rows: Rows):
+def locate_row(row: int, law: Law, surface: Surface, rows: Rows):
     """Find where a pair is closest, and the force with which it begins. Returns whether it may push in this step."""
-    nodes = meeting.body.shape[0]
+    nodes = surface.node.shape[0]
     owner = rows.owner[row]
     is_near = bool(False)
     if owner >= nodes:
-        is_near = locate_edge(row, owner - nodes, rows.other[row], surface, meeting, rows)
+        is_near = locate_edge(row, owner - nodes, rows.other[row], surface, rows)
     elif owner >= 0:
-        is_near = locate_node(row, owner, rows.other[row], surface, meeting, rows)
+        is_near = locate_node(row, owner, rows.other[row], surface, rows)
     was = rows.force[row]
     rows.force[row] = wp.vec3()
     rows.more[row] = wp.vec3()
@@ -387,5 +385,5 @@ def locate_row(row: int, law: Law, surface: Surface, meeting: Meeting, rows: Row
     # creep.
     normal_force = wp.max(wp.dot(was, n), 0.0)
     if normal_force > 0.0:
-        rows.force[row] = normal_force * n + held_back(across(was, n), normal_force, meeting.friction)
+        rows.force[row] = normal_force * n + held_back(across(was, n), normal_force, rows.friction[row])
     return may_push(row, law, surface, rows)

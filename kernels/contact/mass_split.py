@@ -26,7 +26,7 @@ from .explicit_rows import ACTS, BEGINS, ENDS, OUT, WAITS, Rigid, anchor, begin_
 from .law import Law, across, held_back, least_motion, left_to_held
 from .locate import is_apart, list_by_warp, locate_row
 from .motion import Surface
-from .rows import Meeting, Rows, row_count
+from .rows import Rows, row_count
 from .watch import BESIDE, Near
 
 wp.set_module_options({"enable_backward": False})
@@ -90,8 +90,7 @@ class Contacts:
 
     first_pair: int  # the first number of a pair
     rigid: Rigid
-    triangles: wp.array[wp.vec3i]
-    meeting: Meeting
+    searched: wp.array[wp.vec3]  # [S] positions at the last search for pairs [m]
     pairs: Rows
 
 
@@ -231,6 +230,7 @@ def phases(has_triangles: bool, has_pairs: bool) -> SimpleNamespace:
     def contact_of(number: int, dt: float, all: Contacts):
         """The contact with a number, which has been located in this step."""
         found = Contact()
+        surface = all.rigid.surface
         if number < all.first_pair:
             found = read_row(number, all.rigid.rows)
             found.places = wp.vec4i(number % all.rigid.surface.node.shape[0], -1, -1, -1)
@@ -238,13 +238,12 @@ def phases(has_triangles: bool, has_pairs: bool) -> SimpleNamespace:
                 found.weights = wp.vec4(1.0, 0.0, 0.0, 0.0)
             if wp.static(has_triangles):
                 if number >= all.rigid.first_triangle:
-                    c = all.triangles[(number - all.rigid.first_triangle) % all.triangles.shape[0]]
+                    c = surface.triangles[(number - all.rigid.first_triangle) % surface.triangles.shape[0]]
                     found.places = wp.vec4i(c[0], c[1], c[2], -1)
         if wp.static(has_pairs):
             if number >= all.first_pair:
                 found = read_row(number - all.first_pair, all.pairs)
                 found.places = all.pairs.places[number - all.first_pair]
-        surface = all.rigid.surface
         found.parents = parents_of(found.places[0], surface)
         found.opens = -found.moved
         for k in range(most):
@@ -295,10 +294,10 @@ def phases(has_triangles: bool, has_pairs: bool) -> SimpleNamespace:
             is_near = begin_place(number, dt, all.rigid)
         if wp.static(has_triangles):
             if number >= all.rigid.first_triangle and number < all.first_pair:
-                is_near = find_touch(number, all.rigid, all.triangles)
+                is_near = find_touch(number, all.rigid)
         if wp.static(has_pairs):
             if number >= all.first_pair:
-                is_near = locate_row(number - all.first_pair, law, surface, all.meeting, all.pairs)
+                is_near = locate_row(number - all.first_pair, law, surface, all.pairs)
         if not is_near:
             return 0
         contact = contact_of(number, dt, all)
@@ -521,7 +520,7 @@ def solver(has_triangles: bool, has_pairs: bool, on_cpu: bool) -> wp.Kernel:
                     number = all.rigid.first_triangle + near.touches[k - listed_count[0]]
                 if wp.static(on_cpu and has_pairs):
                     row = number - all.first_pair
-                    if row >= 0 and is_apart(row, all.rigid.law, all.rigid.surface, all.meeting, all.pairs):
+                    if row >= 0 and is_apart(row, all.rigid.law, all.rigid.surface, all.searched, all.pairs):
                         number = -1
                 may_act = int(0)
                 if number >= 0:

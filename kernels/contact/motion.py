@@ -39,6 +39,16 @@ class Surface:
     yielding: wp.array[wp.float32]  # [S] additional motion per force [m/N]; zero for held nodes
     f: wp.array[wp.vec3]  # [S] contact force [N]
     bearing: Bearing
+    body: wp.array[wp.int32]  # [S]
+    triangles: wp.array[wp.vec3i]  # [T] places; -1: unused
+    opposite: wp.array[wp.int32]  # [T] the fourth nodes of their tetrahedra, -1 inside the body
+    # [T] fraction of the last step's normal force of an obstacle that is left beside corners that touch
+    warmth: wp.array[wp.float32]
+    edges: wp.array[wp.vec2i]  # [E] places; -1: unused
+    sides: wp.array[wp.vec2i]  # [E] their two triangles
+    # [S + 1] for each place, from one start to the next, three times a triangle there and which corner
+    corner_starts: wp.array[wp.int32]
+    corners: wp.array[wp.int32]
 
 
 @wp.struct

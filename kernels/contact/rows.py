@@ -20,24 +20,15 @@ BAND, BAND_AT_REST, BAND_OF_NEIGHBOURS = wp.constant(0.25), wp.constant(0.1), wp
 
 @wp.struct
 class Meeting:
-    """Items that may touch: triangles and edges of the surface, and the body of each."""
+    """What a search for pairs knows of a surface."""
 
-    body: wp.array[wp.int32]  # [S]
-    triangles: wp.array[wp.vec3i]  # [T]
-    opposite: wp.array[wp.int32]  # [T] the fourth nodes of their tetrahedra, -1 inside the body
-    edges: wp.array[wp.vec2i]  # [E] places, -1 where there is none
-    sides: wp.array[wp.vec2i]  # [E] their two triangles
-    corner_starts: wp.array[wp.int32]  # [S + 1] triangles around each node, see ``Skin``
-    corners: wp.array[wp.int32]
     normals: wp.array[wp.vec3]  # [T] at the last search
     outs: wp.array[wp.vec3]  # [E] the sums of the two normals at each edge, at the last search
     reach: wp.array[wp.float32]  # [S] how far a node may move until the next search for pairs [m]
-    searched: wp.array[wp.vec3]  # [S] positions at the last search [m]
     ahead: wp.array[wp.vec3]  # see ``Watch``
     roots: wp.array3d[wp.int32]  # [2, worlds, bodies] the bodies' roots in the trees of triangles and of edges; CUDA
     meets_itself: int
     flat_edges: int  # whether flat edges may touch flat edges
-    friction: float
 
 
 @wp.struct

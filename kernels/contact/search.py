@@ -41,11 +41,11 @@ MAY_TOUCH = wp.constant(-0.3)
 @wp.func
 def bend(surface: Surface, meeting: Meeting, k: int):
     """The sine of the angle by which the surface bends at an edge, positive if the edge is convex."""
-    sides = meeting.sides[k]
+    sides = surface.sides[k]
     first = meeting.normals[sides[0]]
     second = meeting.normals[sides[1]]
-    e = meeting.edges[k]
-    c = meeting.triangles[sides[1]]
+    e = surface.edges[k]
+    c = surface.triangles[sides[1]]
     middle = (surface.x[c[0]] + surface.x[c[1]] + surface.x[c[2]]) / 3.0
     turn = wp.length(wp.cross(first, second))
     if wp.dot(first, second) < 0.0:
@@ -58,20 +58,20 @@ def bend(surface: Surface, meeting: Meeting, k: int):
 @wp.func
 def may_meet(s: int, r: int, surface: Surface, meeting: Meeting):
     """Whether two places are in one world, and in two bodies or in one that touches itself."""
-    return surface.world[s] == surface.world[r] and (meeting.meets_itself != 0 or meeting.body[s] != meeting.body[r])
+    return surface.world[s] == surface.world[r] and (meeting.meets_itself != 0 or surface.body[s] != surface.body[r])
 
 
 @wp.func
-def node_normal(s: int, meeting: Meeting):
+def node_normal(s: int, surface: Surface, meeting: Meeting):
     """The direction of the sum of the normals around a node."""
     out = wp.vec3()
-    for k in range(meeting.corner_starts[s], meeting.corner_starts[s + 1]):
-        out += meeting.normals[meeting.corners[k] / 3]
+    for k in range(surface.corner_starts[s], surface.corner_starts[s + 1]):
+        out += meeting.normals[surface.corners[k] / 3]
     return wp.normalize(out)
 
 
 @wp.func
-def may_face(s: int, out: wp.vec3, n: wp.vec3, meeting: Meeting):
+def may_face(s: int, out: wp.vec3, n: wp.vec3, surface: Surface, meeting: Meeting):
     """Whether a node with the normal ``out`` may touch a triangle with the normal n before the next search: one of the
     faces around the node, or all together, must face it. A node in a plane face that lies on another body's rim does
     not touch the faces beyond that rim, which would hold it back.
@@ -79,8 +79,8 @@ def may_face(s: int, out: wp.vec3, n: wp.vec3, meeting: Meeting):
     # Nearly all that are near face the triangle together.
     if wp.dot(out, n) < MAY_TOUCH:
         return True
-    for k in range(meeting.corner_starts[s], meeting.corner_starts[s + 1]):
-        if wp.dot(meeting.normals[meeting.corners[k] / 3], n) < MAY_TOUCH:
+    for k in range(surface.corner_starts[s], surface.corner_starts[s + 1]):
+        if wp.dot(meeting.normals[surface.corners[k] / 3], n) < MAY_TOUCH:
             return True
     return False
 
@@ -110,13 +110,13 @@ def approach(s: int, r: int, meeting: Meeting):
 @wp.func
 def node_is_near(s: int, t: int, out: wp.vec3, surface: Surface, meeting: Meeting, near: Near):
     """Whether a node and a triangle may touch before the next search; ``out`` is the normal at the node."""
-    c = meeting.triangles[t]
+    c = surface.triangles[t]
     if c[0] < 0 or not may_meet(s, c[0], surface, meeting):
         return False
-    if c[0] == s or c[1] == s or c[2] == s or meeting.opposite[t] == s:
+    if c[0] == s or c[1] == s or c[2] == s or surface.opposite[t] == s:
         return False
     normal = meeting.normals[t]
-    is_own = meeting.body[s] == meeting.body[c[0]]
+    is_own = surface.body[s] == surface.body[c[0]]
     if is_own and wp.dot(out, normal) > MAY_FACE:
         return False
     a = surface.x[c[0]]
@@ -141,10 +141,10 @@ def node_is_near(s: int, t: int, out: wp.vec3, surface: Surface, meeting: Meetin
             apart = surface.rest[s] - surface.rest[c[0]]
             most = wp.max(wp.length(apart), wp.length(surface.rest[s] - surface.rest[c[1]]))
             most = wp.max(most, wp.length(surface.rest[s] - surface.rest[c[2]]))
-            if distance > far + BAND_AT_REST * most and not node_faces_at_rest(s, c, apart, surface, meeting):
+            if distance > far + BAND_AT_REST * most and not node_faces_at_rest(s, c, apart, surface):
                 return False
     if not is_own:
-        return may_face(s, out, normal, meeting)
+        return may_face(s, out, normal, surface, meeting)
     # Inverted elements have passed through their own body and have to get back.
     flags = near.flags[s] | near.flags[c[0]] | near.flags[c[1]] | near.flags[c[2]]
     if (flags & CRUSHED) != 0:
@@ -156,13 +156,13 @@ def node_is_near(s: int, t: int, out: wp.vec3, surface: Surface, meeting: Meetin
 
 
 @wp.func
-def is_opposite(e: wp.vec2i, m: int, meeting: Meeting):
+def is_opposite(e: wp.vec2i, m: int, surface: Surface):
     """Whether an edge lies opposite to edge m in a tetrahedron at one of its triangles."""
-    f = meeting.edges[m]
+    f = surface.edges[m]
     for k in range(2):
-        t = meeting.sides[m][k]
-        c = meeting.triangles[t]
-        a = meeting.opposite[t]
+        t = surface.sides[m][k]
+        c = surface.triangles[t]
+        a = surface.opposite[t]
         b = c[0] + c[1] + c[2] - f[0] - f[1]
         if (e[0] == a and e[1] == b) or (e[0] == b and e[1] == a):
             return True
@@ -170,7 +170,7 @@ def is_opposite(e: wp.vec2i, m: int, meeting: Meeting):
 
 
 @wp.func
-def flat_edges_cross(k: int, m: int, far: float, s: float, t: float, way: wp.vec3, surface: Surface, meeting: Meeting):
+def flat_edges_cross(k: int, m: int, far: float, s: float, t: float, way: wp.vec3, surface: Surface):
     """Whether flat edges k and m of surfaces that face each other may cross before the next search.
 
     Args:
@@ -178,10 +178,10 @@ def flat_edges_cross(k: int, m: int, far: float, s: float, t: float, way: wp.vec
         s, t: Where they are closest, as shares of their lengths.
         way: From there on m to there on k [m].
     """
-    e = meeting.edges[k]
-    f = meeting.edges[m]
-    out = edge_normal(surface, meeting, m)
-    if wp.dot(out, edge_normal(surface, meeting, k)) > FACING:
+    e = surface.edges[k]
+    f = surface.edges[m]
+    out = edge_normal(surface, m)
+    if wp.dot(out, edge_normal(surface, k)) > FACING:
         return False
     if wp.length(way - wp.dot(way, out) * out) > far:
         return False
@@ -202,13 +202,13 @@ def face_away(first: wp.vec3, second: wp.vec3):
 @wp.func
 def edge_is_near(k: int, m: int, is_sharp: bool, out: wp.vec3, surface: Surface, meeting: Meeting, near: Near):
     """Whether two edges may cross before the next search; ``out`` is the sum of the normals at the first."""
-    e = meeting.edges[k]
-    f = meeting.edges[m]
+    e = surface.edges[k]
+    f = surface.edges[m]
     if f[0] < 0 or not may_meet(e[0], f[0], surface, meeting):
         return False
     if e[0] == f[0] or e[0] == f[1] or e[1] == f[0] or e[1] == f[1]:
         return False
-    is_own = meeting.body[e[0]] == meeting.body[f[0]]
+    is_own = surface.body[e[0]] == surface.body[f[0]]
     if is_own and face_away(out, meeting.outs[m]):
         return False
     p = surface.x[e[0]]
@@ -223,7 +223,7 @@ def edge_is_near(k: int, m: int, is_sharp: bool, out: wp.vec3, surface: Surface,
         wp.max(approach(e[0], f[0], meeting), approach(e[0], f[1], meeting)),
         wp.max(approach(e[1], f[0], meeting), approach(e[1], f[1], meeting)),
     )
-    if not (wp.length(way) <= far + band) or is_opposite(e, m, meeting):
+    if not (wp.length(way) <= far + band) or is_opposite(e, m, surface):
         return False
     if is_own:
         flags = near.flags[e[0]] | near.flags[e[1]] | near.flags[f[0]] | near.flags[f[1]]
@@ -238,7 +238,7 @@ def edge_is_near(k: int, m: int, is_sharp: bool, out: wp.vec3, surface: Surface,
         return False
     if is_sharp:
         return other <= SHARP or m > k
-    return other <= SHARP and m > k and flat_edges_cross(k, m, far, s, t, way, surface, meeting)
+    return other <= SHARP and m > k and flat_edges_cross(k, m, far, s, t, way, surface)
 
 
 @wp.struct
@@ -257,18 +257,18 @@ class Owner:
 @wp.func
 def owner_of(i: int, surface: Surface, meeting: Meeting):
     """The node or the edge with a number; an edge looks for others if it is sharp, or flat if these touch."""
-    nodes = meeting.body.shape[0]
+    nodes = surface.node.shape[0]
     found = Owner()
     found.place = -1
     if i < nodes:
         if surface.node[i] >= 0:
             found.place = i
-            found.out = node_normal(i, meeting)
+            found.out = node_normal(i, surface, meeting)
             found.reach = meeting.reach[i]
             found.low = lower_end(i, surface, meeting)
             found.high = upper_end(i, surface, meeting)
     else:
-        e = meeting.edges[i - nodes]
+        e = surface.edges[i - nodes]
         if e[0] >= 0:
             own = bend(surface, meeting, i - nodes)
             if own > SHARP or (own >= -SHARP and meeting.flat_edges != 0):
@@ -289,46 +289,29 @@ def owner_of(i: int, surface: Surface, meeting: Meeting):
 def is_near(i: int, other: int, owner: Owner, surface: Surface, meeting: Meeting, near: Near):
     """Whether an owner may touch a triangle or an edge before the next search."""
     if owner.is_edge != 0:
-        k = i - meeting.body.shape[0]
+        k = i - surface.node.shape[0]
         return edge_is_near(k, other, owner.is_sharp, owner.out, surface, meeting, near)
     return node_is_near(i, other, owner.out, surface, meeting, near)
 
 
 @wp.func
-def mark_row(owner: int, other: int, meeting: Meeting, near: Near):
-    """Mark the nodes of a pair."""
-    nodes = meeting.body.shape[0]
-    if owner < nodes:
-        c = meeting.triangles[other]
-        mark(near, owner, PAIRED)
-        for k in range(3):
-            mark(near, c[k], PAIRED)
-    else:
-        e = meeting.edges[owner - nodes]
-        f = meeting.edges[other]
-        for k in range(2):
-            mark(near, e[k], PAIRED)
-            mark(near, f[k], PAIRED)
-
-
-@wp.func
-def places_in(owner: int, other: int, meeting: Meeting):
+def places_in(owner: int, other: int, surface: Surface):
     """The places of a pair."""
-    nodes = meeting.body.shape[0]
+    nodes = surface.node.shape[0]
     if owner < nodes:
-        c = meeting.triangles[other]
+        c = surface.triangles[other]
         return wp.vec4i(owner, c[0], c[1], c[2])
-    e = meeting.edges[owner - nodes]
-    f = meeting.edges[other]
+    e = surface.edges[owner - nodes]
+    f = surface.edges[other]
     return wp.vec4i(e[0], e[1], f[0], f[1])
 
 
 @wp.func
 def distance_in(owner: int, other: int, surface: Surface, meeting: Meeting):
     """How far the two of a pair are apart at least; zero if they overlap [m]."""
-    nodes = meeting.body.shape[0]
+    nodes = surface.node.shape[0]
     if owner < nodes:
-        c = meeting.triangles[other]
+        c = surface.triangles[other]
         a = surface.x[c[0]]
         b = surface.x[c[1]]
         e = surface.x[c[2]]
@@ -336,8 +319,8 @@ def distance_in(owner: int, other: int, surface: Surface, meeting: Meeting):
         # A gap may be less than the distance where a node is beside a triangle; see ``locate_node``.
         far = wp.length(way) - BORDER * triangle_size(surface, c)
         return wp.where(wp.dot(way, meeting.normals[other]) < 0.0, 0.0, wp.max(far, 0.0))
-    f = meeting.edges[owner - nodes]
-    g = meeting.edges[other]
+    f = surface.edges[owner - nodes]
+    g = surface.edges[other]
     p = surface.x[f[0]]
     q = surface.x[f[1]]
     r = surface.x[g[0]]
@@ -360,12 +343,12 @@ def pair_finder(is_wide: bool) -> wp.Kernel:
         way = wp.vec3()
         out = owner.out
         if owner.is_edge != 0:
-            way = surface.x[meeting.edges[i - meeting.body.shape[0]][1]] - surface.x[owner.place]
+            way = surface.x[surface.edges[i - surface.node.shape[0]][1]] - surface.x[owner.place]
             out = wp.where(wp.length(out) < BLUNT, wp.vec3(), wp.normalize(out))
         reach = wp.where(meeting.ahead.shape[0] > 0, -1.0, NEARLY * owner.reach)
         world = surface.world[owner.place]
         found = query_wide(
-            tree, owner.is_edge, world, meeting.body[owner.place], meeting.meets_itself, owner.low, owner.high, out,
+            tree, owner.is_edge, world, surface.body[owner.place], meeting.meets_itself, owner.low, owner.high, out,
             reach, surface.x[owner.place], way,
         )  # fmt: skip
         count = int(0)
@@ -389,7 +372,7 @@ def pair_finder(is_wide: bool) -> wp.Kernel:
         if owner.is_edge != 0:
             tree = of_edges
         for body in range(meeting.roots.shape[2]):
-            if meeting.meets_itself != 0 or body != meeting.body[owner.place]:
+            if meeting.meets_itself != 0 or body != surface.body[owner.place]:
                 root = meeting.roots[owner.is_edge, surface.world[owner.place], body]
                 query = wp.bvh_query_aabb(tree, owner.low, owner.high, root)
                 goes_on = bool(True)
@@ -499,13 +482,15 @@ def pair_finder(is_wide: bool) -> wp.Kernel:
             if before < last and old.other[before] == other:
                 acts = old.acts[before]
                 force = old.force[before]
+            places = places_in(i, other, surface)
             rows.owner[row] = i
             rows.acts[row] = acts
             rows.force[row] = force
             if wp.static(is_wide):
-                rows.places[row] = places_in(i, other, meeting)
+                rows.places[row] = places
                 rows.away[row] = distance_in(i, other, surface, meeting)
-            mark_row(i, other, meeting, near)
+            for m in range(4):
+                mark(near, places[m], PAIRED)
             row += lanes
 
     return find_pairs

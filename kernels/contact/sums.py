@@ -72,15 +72,7 @@ def area_vector(surface: Surface, corners: wp.vec3i):
 
 
 @wp.kernel(enable_backward=False)
-def node_pressures(
-    # In
-    surface: Surface,
-    triangles: wp.array[wp.vec3i],
-    corner_starts: wp.array[wp.int32],
-    corners: wp.array[wp.int32],
-    # Out
-    pressures: wp.array[wp.vec3],
-):
+def node_pressures(surface: Surface, pressures: wp.array[wp.vec3]):
     """Find the pressure at each node [Pa]: the force into the body, along the mean normal of the loaded triangles
     around the node, over a third of their area.
     """
@@ -90,13 +82,13 @@ def node_pressures(
     if wp.dot(force, force) == 0.0:
         return
     outward = wp.vec3()
-    for k in range(corner_starts[s], corner_starts[s + 1]):
-        own = area_vector(surface, triangles[corners[k] / 3])
+    for k in range(surface.corner_starts[s], surface.corner_starts[s + 1]):
+        own = area_vector(surface, surface.triangles[surface.corners[k] / 3])
         outward += wp.max(-wp.dot(wp.normalize(own), force), 0.0) * own
     outward = wp.normalize(outward)
     area = float(0.0)
-    for k in range(corner_starts[s], corner_starts[s + 1]):
-        own = area_vector(surface, triangles[corners[k] / 3])
+    for k in range(surface.corner_starts[s], surface.corner_starts[s + 1]):
+        own = area_vector(surface, surface.triangles[surface.corners[k] / 3])
         facing = wp.max(wp.dot(wp.normalize(own), outward), 0.0)
         area += wp.length(own) * facing * facing / 3.0
     if area > 0.0:
@@ -104,16 +96,10 @@ def node_pressures(
 
 
 @wp.kernel(enable_backward=False)
-def triangle_pressures(
-    first: int,
-    surface: Surface,
-    triangles: wp.array[wp.vec3i],
-    pressures: wp.array[wp.vec3],
-    found: wp.array[wp.float32],
-):
+def triangle_pressures(first: int, surface: Surface, pressures: wp.array[wp.vec3], found: wp.array[wp.float32]):
     """Average the pressure over each triangle of a body, so that pressure times area adds up to the normal forces."""
     t = wp.tid()
-    c = triangles[first + t]
+    c = surface.triangles[first + t]
     pressure = float(0.0)
     if c[0] >= 0:
         normal = wp.normalize(area_vector(surface, c))
@@ -145,32 +131,25 @@ def measure_gaps(
 
 
 @wp.kernel(enable_backward=False)
-def share_touches(
-    # In
-    corner_starts: wp.array[wp.int32],
-    corners: wp.array[wp.int32],
-    triangles: int,
-    rigid: Rigid,
-    # Out
-    totals: wp.array2d[wp.vec3],
-):
+def share_touches(rigid: Rigid, totals: wp.array2d[wp.vec3]):
     """Add the forces of obstacles on nodes and the nodes' shares of the forces on triangles [N]."""
     o, s = wp.tid()
-    total = rigid.rows.force[o * rigid.surface.node.shape[0] + s]
-    for k in range(corner_starts[s], corner_starts[s + 1]):
-        r = rigid.first_triangle + o * triangles + corners[k] / 3
+    surface = rigid.surface
+    total = rigid.rows.force[o * surface.node.shape[0] + s]
+    for k in range(surface.corner_starts[s], surface.corner_starts[s + 1]):
+        r = rigid.first_triangle + o * surface.triangles.shape[0] + surface.corners[k] / 3
         if rigid.rows.acts[r] != 0:
-            total += rigid.rows.weights[r][corners[k] % 3] * rigid.rows.force[r]
+            total += rigid.rows.weights[r][surface.corners[k] % 3] * rigid.rows.force[r]
     totals[o, s] = total
 
 
 @wp.kernel(enable_backward=False)
-def forget_rows(chosen: wp.array[wp.int32], triangles: wp.array[wp.vec3i], rigid: Rigid):
+def forget_rows(chosen: wp.array[wp.int32], rigid: Rigid):
     """Forget the last step's contact with obstacles in chosen worlds."""
     r = wp.tid()
     s = r % rigid.surface.node.shape[0]
     if r >= rigid.first_triangle:
-        s = triangles[(r - rigid.first_triangle) % triangles.shape[0]][0]
+        s = rigid.surface.triangles[(r - rigid.first_triangle) % rigid.surface.triangles.shape[0]][0]
     if s >= 0 and rigid.surface.node[s] >= 0 and chosen[rigid.surface.world[s]] != 0:
         rigid.rows.force[r] = wp.vec3()
         rigid.allowance[r] = 0.0

@@ -67,7 +67,7 @@ def triangle_end(c: wp.vec3i, surface: Surface, meeting: Meeting):
 def box_triangles(surface: Surface, meeting: Meeting, lower: wp.array[wp.vec3], upper: wp.array[wp.vec3]):
     """Find the boxes of triangles, and their normals."""
     t = wp.tid()
-    c = meeting.triangles[t]
+    c = surface.triangles[t]
     if c[0] < 0:
         lower[t] = wp.vec3(NOWHERE, NOWHERE, NOWHERE)
         upper[t] = lower[t]
@@ -83,12 +83,12 @@ def box_triangles(surface: Surface, meeting: Meeting, lower: wp.array[wp.vec3], 
 def box_edges(surface: Surface, meeting: Meeting, lower: wp.array[wp.vec3], upper: wp.array[wp.vec3]):
     """Find the boxes of edges, and the sum of the normals of the triangles at each, which must be known."""
     k = wp.tid()
-    e = meeting.edges[k]
+    e = surface.edges[k]
     if e[0] < 0:
         lower[k] = wp.vec3(NOWHERE, NOWHERE, NOWHERE)
         upper[k] = lower[k]
         return
-    sides = meeting.sides[k]
+    sides = surface.sides[k]
     meeting.outs[k] = meeting.normals[sides[0]] + meeting.normals[sides[1]]
     a = surface.x[e[0]]
     b = surface.x[e[1]]
@@ -306,7 +306,7 @@ def fill_leaves(
                 low = wp.min(low, lower[t])
                 high = wp.max(high, upper[t])
                 n = meeting.normals[t]
-                c = meeting.triangles[t]
+                c = surface.triangles[t]
                 write_lane(tree.triangle_nodes, node, lane, lower[t], upper[t], n)
                 for k in range(3):
                     x = surface.x[c[k]]
@@ -326,11 +326,11 @@ def fill_leaves(
                 # Others may touch whatever way they face.
                 out = wp.where(length < BLUNT, wp.vec3(), out / length)
                 write_lane(tree.edge_nodes, node, lane, edge_lower[e], edge_upper[e], out)
-                a = surface.x[meeting.edges[e][0]]
-                way = surface.x[meeting.edges[e][1]] - a
+                a = surface.x[surface.edges[e][0]]
+                way = surface.x[surface.edges[e][1]] - a
                 write_row(tree.edge_nodes, node, lane, 9, a)
                 write_row(tree.edge_nodes, node, lane, 12, way)
-                far = edge_reach(meeting, meeting.edges[e]) + BAND * wp.length(way)
+                far = edge_reach(meeting, surface.edges[e]) + BAND * wp.length(way)
                 tree.edge_nodes[LANES * (ROWS * node + 15) + lane] = NEARLY * far
     write_lane(tree.lower_nodes, z / LANES, z % LANES, low, high, wp.vec3())
 

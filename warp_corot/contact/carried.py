@@ -175,13 +175,12 @@ class CarriedForces:
         owner, other = (array[:count].numpy() if count else self._rows[0] for array in (rows.owner, rows.other))
         acts = np.flatnonzero(force.any(axis=1) & (owner >= 0))
         self._rows = owner[acts].astype(np.int64), other[acts].astype(np.int64), force[acts]
-        meeting = pairs.meeting
         is_node = self._rows[0] < nodes
         self._loaded[0][self._rows[0][is_node]] = True
         self._loaded[1][self._rows[1][is_node]] = True
         edges = np.concatenate([self._rows[0][~is_node] - nodes, self._rows[1][~is_node]])
         if len(edges):
-            self._loaded[0][meeting.edges.numpy()[edges]] = True
+            self._loaded[0][pairs.surface.edges.numpy()[edges]] = True
 
     def _give_rows(self, pairs: Pairs, found: _Moved) -> None:
         rows, room = pairs.rows, pairs.room

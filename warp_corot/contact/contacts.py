@@ -278,11 +278,10 @@ class Contacts:
             self.split.launch_place_forces(forces)
             if self.approach is not None:
                 self.approach.launch_completion()
-        inputs = [surface.arrays, surface.triangles, surface.corner_starts, surface.corners]
-        self._launch(sums.node_pressures, surface.count, inputs, [self._pressures])
+        self._launch(sums.node_pressures, surface.count, [surface.arrays], [self._pressures])
         self._shared.exchange(self._pressures)
         for k, part in enumerate(surface.parts):
-            inputs = [part.triangle_start, surface.arrays, surface.triangles, self._pressures]
+            inputs = [part.triangle_start, surface.arrays, self._pressures]
             outputs = [self._triangle_pressures[k]]
             self._launch(sums.triangle_pressures, self.system.worlds * part.triangles, inputs, outputs)
 

@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import warp as wp
 
-from warp_corot.kernels.contact import bearing, onsets
+from warp_corot.kernels.contact import bearing
+from warp_corot.kernels.contact import implicit_location as location
 from warp_corot.kernels.contact import implicit_rows as kernels
 from warp_corot.kernels.contact.closest import Rolling
 from warp_corot.kernels.contact.law import Law
 from warp_corot.kernels.contact.motion import Surface
-from warp_corot.kernels.contact.obstacle_rows import locate_obstacles
-from warp_corot.kernels.contact.pair_rows import find_strays, locate_pairs
-from warp_corot.kernels.contact.rows import Meeting, Rows
+from warp_corot.kernels.contact.rows import Rows
 from warp_corot.kernels.implicit.assembled import Couplings
 from warp_corot.solvers.implicit.operator import Springs
 from warp_corot.solvers.system import System
@@ -104,14 +104,15 @@ class ImplicitContact:
             for name, dtype in fields.items():
                 setattr(rows, name, self._zeros(size, dtype))
         self._carriers = bearing.Carriers()
+        self._carriers.surface = surface.arrays
         for name, dtype in {"entry": wp.int32, "compliance": wp.float32, "gone": wp.vec3}.items():
             setattr(self._carriers, name, self._zeros(carriers, dtype))
         self._carriers.crowd = self._zeros((2, carriers), wp.float32)
+        rows.carriers = self._carriers
         self._marked, self._added = self._zeros(carriers, wp.int32), self._zeros(surface.count, wp.vec3)
         # Places of their own, where pairs are located: obstacles find the places where they are when a step begins.
-        self._located = Surface()
-        for name in ("node", "world", "rest", "d", "yielding", "f", "bearing"):
-            setattr(self._located, name, getattr(surface.arrays, name))
+        self._located: Any = Surface()
+        self._located.assign(surface.arrays)
         self._located.x = self._zeros(surface.count if room else 0, wp.vec3)
         self._stiffness = self._zeros(surface.count, wp.mat33)
         self._springs: dict[int, Springs] = {}
@@ -153,29 +154,28 @@ class ImplicitContact:
             touched: What the nodes of each body have touched, int32 [worlds * nodes]; see ``launch_touched``.
             begins: Nonzero afterwards if so, int32 [1].
         """
-        pace, surface, law = self._system.pace.arrays, self._surface.arrays, self._law
+        pace = self._system.pace.arrays
         for k, body in enumerate(self._system.bodies):
             start, _, count, own = self._nodes_of(k)
             state = body.state
             inputs = [start, state.rest, state.displacements, state.velocities, pace, touched[k]]
-            wp.launch(onsets.foresee_places, count, inputs, [own, begins], device=self.device)
+            wp.launch(bearing.foresee_places, count, inputs, [own, begins], device=self.device)
             self._launch_places(k)
         if self._rigid is not None:
-            obstacles = self._obstacles
-            inputs = [obstacles.shapes, obstacles.motions, law, surface, self._carriers, self._rigid.forces]
-            wp.launch(onsets.find_onsets, self._surface.count, inputs, [begins], device=self.device)
+            inputs = [self._rigid.arrays, self._carriers]
+            wp.launch(location.find_onsets, self._surface.count, inputs, [begins], device=self.device)
         if self._pairs is not None:
             self._launch_search(offset)
-            inputs = [law, surface, self._pairs.meeting, self._pairs.rows]
-            self._on_pairs(onsets.find_pair_onsets, [*inputs, begins])
+            inputs = [self._law, self._surface.arrays, self._pairs.rows, begins]
+            self._on_pairs(location.find_pair_onsets, inputs)
 
     def launch_touched(self, touched: Sequence[wp.array]) -> None:
         """Launch the record, after a step, of what the nodes of each body have touched."""
-        inputs = [max(self._obstacles.count, 1), self._surface.arrays, self._rows, self._marked]
+        inputs = [max(self._obstacles.count, 1), self._rows, self._marked]
         self._on_rows(kernels.mark_acting, inputs)
         for k, array in enumerate(touched):
             start, offset, count, own = self._nodes_of(k)
-            wp.launch(onsets.note_touched, count, [start, offset, own, self._marked, array], device=self.device)
+            wp.launch(bearing.note_touched, count, [start, offset, own, self._marked, array], device=self.device)
 
     def launch_begin(self, k: int, first: int, blocks: wp.array, increment: wp.array, guess: wp.array) -> None:
         """Launch the state of the k-th body at the beginning of a step.
@@ -209,19 +209,19 @@ class ImplicitContact:
 
     def update(self, d: wp.array, *, is_solved: bool = False) -> None:
         """Launch forces and their derivatives after motions d, which are those of a solve if ``is_solved``."""
-        self._on_rows(kernels.update_rows, [int(is_solved), d, *self._table])
+        self._on_rows(kernels.update_rows, [int(is_solved), d, self._rows])
 
     def add_forces(self, y: wp.array) -> None:
         """Launch the addition of forces on free nodes [N]."""
-        self._on_rows(kernels.add_row_forces, [*self._table, y])
+        self._on_rows(kernels.add_row_forces, [self._rows, y])
 
     def add_products(self, x: wp.array, y: wp.array) -> None:
         """Launch the addition of the derivative times x."""
-        self._on_rows(kernels.add_row_products, [*self._table, x, y])
+        self._on_rows(kernels.add_row_products, [self._rows, x, y])
 
     def add_couplings(self, couplings: Couplings) -> None:
         """Launch the addition of the derivative to an assembled matrix."""
-        self._on_rows(kernels.couple_rows, [*self._table, couplings])
+        self._on_rows(kernels.couple_rows, [self._rows, couplings])
 
     def update_springs(self) -> None:
         """Launch the stiffness of ``springs``, from the derivatives of the last ``update``."""
@@ -230,12 +230,12 @@ class ImplicitContact:
 
     def scale(self, k: int, v: wp.array, *, is_after: bool) -> None:
         """Launch v = G v with the springs at a body's nodes, or G^T v; see ``scale_nodes``."""
-        inputs = [self._surface.parts[k].start, self._firsts[k], int(is_after), self._surface.arrays, self._carriers]
+        inputs = [self._surface.parts[k].start, self._firsts[k], int(is_after), self._carriers]
         wp.launch(kernels.scale_nodes, self.places_of(k), [*inputs, self._stiffness, v], device=self.device)
 
     def find_reached(self, d: wp.array, change: wp.array) -> None:
         """Launch the list of rows that may push along a change of the motions d; ``add_slopes`` visits only these."""
-        self._on_rows(kernels.find_reached, [d, change, *self._table])
+        self._on_rows(kernels.find_reached, [d, change, self._rows])
 
     def add_slopes(
         self, d: wp.array, change: wp.array, search: wp.array, slopes: wp.array, *, apart: int | None = None
@@ -246,7 +246,7 @@ class ImplicitContact:
         its places, [worlds * places].
         """
         first = -1 if apart is None else self._surface.parts[apart].start
-        inputs = [int(len(search) == 1), first, *self._table, d, change, search, slopes]
+        inputs = [int(len(search) == 1), first, self._rows, d, change, search, slopes]
         self._on_rows(kernels.add_row_slopes, inputs)
 
     def launch_going(self, d: wp.array, rounds: wp.array, most: int, going: wp.array) -> None:
@@ -274,17 +274,16 @@ class ImplicitContact:
         assert self._pairs is not None
         again.zero_()
         inputs = [d, self._carriers, self._searches, rounds, most]
-        outputs = [self._pairs.search.watch, self._surface.arrays, again]
-        wp.launch(find_strays, self._surface.count, inputs, outputs, device=self.device)
+        outputs = [self._pairs.search.watch, again]
+        wp.launch(location.find_strays, self._surface.count, inputs, outputs, device=self.device)
         wp.capture_if(again, self._search_again, d=d)
 
     def launch_end(self, d: wp.array) -> None:
         """Launch the update of what users read about contact, and of whether a new search is due."""
         surface, beside = self._surface, Rows() if self._rigid is None else self._rigid.rows
         self.update(d)
-        self._launch(kernels.end_rows, self._length, [self._rows, beside, self._of_pairs[1], self._added])
-        inputs = [d, self._carriers, self._added, surface.arrays]
-        wp.launch(kernels.end_places, surface.count, inputs, device=self.device)
+        self._launch(kernels.end_rows, self._length, [self._rows, beside, self._pair_rows, self._added])
+        wp.launch(kernels.end_places, surface.count, [d, self._added, self._carriers], device=self.device)
         for k, body in enumerate(self._system.bodies):
             start, _, count, own = self._nodes_of(k)
             inputs = [start, int(surface.parts[k].bearers > 0), own, surface.arrays]
@@ -308,31 +307,23 @@ class ImplicitContact:
         self._locate(kernels.REPEATED, d)
 
     def _locate(self, which: int, d: wp.array) -> None:
-        surface, law, pace = self._surface, self._law, self._system.pace.arrays
-        inputs = [int(which), d, surface.arrays, self._located, self._carriers, self._rows]
+        inputs = [int(which), d, self._located, self._rows]
         wp.launch(kernels.begin_location, len(self._marked), inputs, device=self.device)
         if self._rigid is not None and which != kernels.REPEATED:
             self._locate_obstacles(which, d, self._none)
         if self._pairs is not None:
-            meeting, pairs = self._of_pairs
-            inputs = [int(which), law, pace, d, self._located, meeting, self._carriers, pairs, self._rows]
-            self._on_pairs(locate_pairs, inputs)
-        self._on_rows(kernels.stiffen_rows, [int(which), self.changed, *self._table])
+            inputs = [int(which), self._law, self._system.pace.arrays, d, self._located, self._pair_rows, self._rows]
+            self._on_pairs(location.locate_pairs, inputs)
+        self._on_rows(kernels.stiffen_rows, [int(which), self.changed, self._rows])
 
     def _locate_obstacles(self, which: int, d: wp.array, going: wp.array) -> None:
         assert self._rigid is not None
-        surface, rigid, obstacles, pace = self._surface, self._rigid, self._obstacles, self._system.pace.arrays
-        inputs = [int(which), obstacles.shapes, obstacles.motions, self._law, pace, surface.arrays]
-        inputs += [surface.triangles, d, rigid.rows, going, self._carriers, self._rows, self.changed]
-        self._launch(locate_obstacles, self._items, inputs, most=self._items)
+        inputs = [int(which), self._rigid.arrays, self._system.pace.arrays, d, going, self._rows, self.changed]
+        self._launch(location.locate_obstacles, self._items, inputs, most=self._items)
 
     @property
-    def _of_pairs(self) -> tuple[Meeting, Rows]:
-        return (Meeting(), Rows()) if self._pairs is None else (self._pairs.meeting, self._pairs.rows)
-
-    @property
-    def _table(self) -> list:
-        return [self._surface.arrays, self._carriers, self._rows]
+    def _pair_rows(self) -> Rows:
+        return Rows() if self._pairs is None else self._pairs.rows
 
     def _nodes_of(self, k: int) -> tuple[int, int, int, Surface]:
         """The carriers of a body as nodes: the first, the number of carriers before these nodes, how many there are,

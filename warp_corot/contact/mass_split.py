@@ -13,7 +13,7 @@ from warp_corot.kernels.contact import mass_split as kernels
 from warp_corot.kernels.contact.approach import Part, Visits
 from warp_corot.kernels.contact.explicit_rows import Rigid
 from warp_corot.kernels.contact.law import Law
-from warp_corot.kernels.contact.rows import Meeting, Rows
+from warp_corot.kernels.contact.rows import Rows
 from warp_corot.kernels.contact.watch import Near
 from warp_corot.kernels.stepping.pace import Pace
 from warp_corot.kernels.stepping.threads import LINE
@@ -168,9 +168,9 @@ class MassSplit:
 
     def _launch(self, near: Near, first: int, last: int, part: int) -> None:
         contacts, pairs = kernels.Contacts(), self._pairs
-        contacts.first_pair, contacts.triangles = self.first_pair, self.surface.triangles
+        contacts.first_pair, contacts.searched = self.first_pair, self._search.watch.places
         contacts.rigid = rigid_of(self._rigid, self.surface, self._law)
-        contacts.meeting, contacts.pairs = (Meeting(), Rows()) if pairs is None else (pairs.meeting, pairs.rows)
+        contacts.pairs = Rows() if pairs is None else pairs.rows
         inputs: list = [self._threads, part, first, last, self.iterations, int(self._are_separate)]
         inputs += [self._search.watch.awake, near, *self._listed, self._pace]
         outputs = [contacts, self._records, self.sums]
@@ -250,16 +250,15 @@ class Approach:
                 for name, size in of.items():
                     setattr(visits, name, wp.zeros(size, dtype=dtype, device=device))
             visits.step = wp.zeros(1, dtype=wp.int64, device=device)
-            visits.body = wp.array(surface.body_of_places(), dtype=wp.int32, device=device)
             visits.first_place = wp.array([part.start for part in surface.parts], dtype=wp.int32, device=device)
-            visits.triangles, visits.corner_starts = surface.triangles, surface.corner_starts
-            visits.corners, visits.is_shared = surface.corners, int(self._regions.team.parts > 1)
-            self._visits, self.here = visits, Near()
+            visits.is_shared, visits.has_edges = int(self._regions.team.parts > 1), int(self._rigid.have_edges)
+            self._visits, self.here = visits, visits.here
             lists = {"flags": places, "nodes": places, "touches": touches, "count": 1, "touch_count": 1}
             for name, size in lists.items():
                 setattr(self.here, name, wp.zeros(size, dtype=wp.int32, device=device))
         inputs = [surface.arrays.bearing, self._visits.entries]
         wp.launch(approach.find_entries, surface.bearer_count, inputs, device=device)
+        self._visits.rigid, self._visits.watch = self._rigid.arrays, self._search.watch
         self.forget()
 
     def forget(self) -> None:
@@ -274,15 +273,13 @@ class Approach:
             damping: The rate of damping [1/s].
             accounts: Count work on each body, if it is counted here.
         """
-        system, watch, visits = self._system, self._search.watch, self._visits
-        inputs = [self._obstacles.motions, system.pace.arrays, system.bodies[0].conditions.world_starts, offset]
-        wp.launch(
-            approach.begin_visits, 1, [*inputs, self._rigid.arrays], [watch, self.here, visits], device=self._device
-        )
+        system, visits = self._system, self._visits
+        inputs = [system.pace.arrays, system.bodies[0].conditions.world_starts, offset]
+        wp.launch(approach.begin_visits, 1, inputs, [visits], device=self._device)
         if len(system.constraints) > 1:  # which add to them
             self._clear()
-        self._over_parts(approach.find_due, offset, damping, [watch, visits])
-        wp.capture_if(watch.awake, partial(self._act, offset, damping, accounts))
+        self._find_due(offset, damping)
+        wp.capture_if(visits.watch.awake, partial(self._act, offset, damping, accounts))
 
     def launch_end(self) -> None:
         """Launch what notes the end of a run."""
@@ -291,56 +288,51 @@ class Approach:
     def launch_completion(self) -> None:
         """Launch the places of the corners of all triangles on which contact presses."""
         for k in range(len(self._system.bodies)):
-            inputs = [self._system.pace.arrays, self._part(k, 0.0), self._visits]
-            wp.launch(approach.complete_triangles, 1, inputs, [self._surface.arrays], device=self._device)
+            inputs = [self._part(k, 0, 0.0), self._visits]
+            wp.launch(approach.complete_triangles, 1, inputs, device=self._device)
 
     # --- pieces ----------------------------------------------------------------------------------------------------
 
-    def _part(self, k: int, damping: float) -> Part:
-        """The surface of the k-th body, as a struct for approach."""
+    def _part(self, k: int, offset: int, damping: float) -> Part:
+        """The surface of the k-th body, as a struct for kernels."""
         part, of = Part(), self._surface.parts[k]
         part.number, part.place, part.shift = k, of.start, self._surface.count if of.bearers else 0
         part.start, _count, part.nodes = self._surface.nodes_of(k)
         part.dynamics = self._system.dynamics(self._system.bodies[k], damping)
+        part.pace, part.offset = self._system.pace.arrays, offset
         return part
 
-    def _over_parts(self, kernel: wp.Kernel, offset: int, damping: float, outputs: list) -> None:
-        """Launch a kernel over the carriers of each body, in parts."""
+    def _find_due(self, offset: int, damping: float) -> None:
+        """Launch the search for carriers of each body that are due, in parts."""
         for k in range(len(self._system.bodies)):
             start, count, _nodes = self._surface.nodes_of(k)
-            bounds, inputs = (
-                self._regions.team.bounds(count),
-                [self._part(k, damping), self._system.pace.arrays, offset],
-            )
+            bounds, inputs = self._regions.team.bounds(count), [self._part(k, offset, damping), self._visits]
 
             def over(part: int, start: int = start, bounds: list = bounds, inputs: list = inputs) -> None:
                 begin, end = bounds[part]
-                launch(kernel, 1, [start + begin, start + end, *inputs], outputs, device=self._device)
+                launch(approach.find_due, 1, [start + begin, start + end, *inputs], [], device=self._device)
 
-            self._regions.launch((kernel, k, offset), over)
+            self._regions.launch((approach.find_due, k, offset), over)
 
     def _act(self, offset: int, damping: float, accounts: list[wp.array] | None) -> None:
         """Launch the contact of a step in which anything is due."""
-        threads, watch, pace = self._regions.team.parts, self._search.watch, self._system.pace.arrays
-        has_edges = int(self._rigid.have_edges)
-        outputs = [self._rigid.arrays, self._visits, self.here]
-        last = int(approach.LIMIT)
+        threads, last = self._regions.team.parts, int(approach.LIMIT)
         spans = [(0, last)] if threads == 1 else [(phase, phase) for phase in range(last + 1)]
         for k in range(len(self._system.bodies)):
-            inputs = [self._part(k, damping), pace, offset, has_edges, watch]
+            inputs = [self._part(k, offset, damping), self._visits]
 
             def visit(first: int, last: int, part: int, inputs: list = inputs) -> None:
-                launch(approach.visit, 1, [threads, part, first, last, *inputs], outputs, device=self._device)
+                launch(approach.visit, 1, [threads, part, first, last, *inputs], [], device=self._device)
 
             self._regions.launch((approach.visit, k, offset), *(partial(visit, *span) for span in spans))
         self._split.launch(self.here, (self._visits.contacts, self._visits.contact_count))
         self._clear()
-        given = [self._split.buffer, self._split.grain, self._visits, int(accounts is not None), pace, offset]
         for k, body in enumerate(self._system.bodies):
             account = None if accounts is None else accounts[k]
-            outputs = [self._part(k, damping), self._split.sums, account, body.state.contact_forces]
+            given = [self._split.buffer, self._split.grain, int(accounts is not None), self._part(k, offset, damping)]
+            outputs = [self._visits, self._split.sums, account, body.state.contact_forces]
 
-            def end(part: int, outputs: list = outputs) -> None:
+            def end(part: int, given: list = given, outputs: list = outputs) -> None:
                 launch(approach.end_visits, 1, [threads, part, *given], outputs, device=self._device)
 
             self._regions.launch((approach.end_visits, k, offset), end)

@@ -341,7 +341,7 @@ class RigidForces:
         """The obstacles, the surfaces and what is between them, as a struct for kernels."""
         rigid = Rigid()
         rigid.shapes, rigid.motions, rigid.law = self.obstacles.shapes, self.obstacles.motions, self._law
-        rigid.surface, rigid.first_triangle, rigid.warmth = self.surface.arrays, self.totals.size, self.surface.warmth
+        rigid.surface, rigid.first_triangle = self.surface.arrays, self.totals.size
         rigid.anchors, rigid.allowance, rigid.rows = self.anchors, self.allowance, self.rows
         return rigid
 
@@ -367,8 +367,7 @@ class RigidForces:
 
     def reset(self, chosen: wp.array) -> None:
         """Forget the last step in chosen worlds, nonzero in int32 [worlds]."""
-        inputs = [chosen, self.surface.triangles, self.arrays]
-        wp.launch(sums.forget_rows, len(self.rows.force), inputs, device=self.device)
+        wp.launch(sums.forget_rows, len(self.rows.force), [chosen, self.arrays], device=self.device)
 
     @property
     def state(self) -> dict[str, wp.array]:
@@ -391,9 +390,7 @@ class RigidForces:
         """Launch the sums of all forces of each obstacle on each node, [O, S]."""
         if not self.have_edges:
             return self.forces
-        surface = self.surface
-        inputs = [surface.corner_starts, surface.corners, surface.triangle_count, self.arrays]
-        wp.launch(sums.share_touches, self.totals.shape, inputs, [self.totals], device=self.device)
+        wp.launch(sums.share_touches, self.totals.shape, [self.arrays], [self.totals], device=self.device)
         return self.totals
 
 

@@ -79,16 +79,10 @@ class Pairs:
         self._taken = surface.revision
         count, edges = surface.count, surface.edge_count
         meeting = Meeting()
-        meeting.body = wp.array(surface.body_of_places(), dtype=wp.int32, device=device)
-        meeting.triangles, meeting.edges, meeting.sides = surface.triangles, surface.edges, surface.sides
-        meeting.opposite = surface.opposite
-        meeting.corner_starts, meeting.corners = surface.corner_starts, surface.corners
         meeting.normals = wp.zeros(surface.triangle_count, dtype=wp.vec3, device=device)
         meeting.outs = wp.zeros(edges, dtype=wp.vec3, device=device)
-        watch = self.search.watch
-        meeting.reach, meeting.searched, meeting.ahead = watch.reach, watch.places, watch.ahead
-        meeting.meets_itself, meeting.friction = int(self.meets_itself), self.friction
-        meeting.flat_edges = int(self._flat_edges)
+        meeting.reach, meeting.ahead = self.search.watch.reach, self.search.watch.ahead
+        meeting.meets_itself, meeting.flat_edges = int(self.meets_itself), int(self._flat_edges)
         meeting.roots = wp.zeros((2, surface.worlds, len(surface.parts)), dtype=wp.int32, device=device)
         self.meeting = meeting
         self.tree, self._is_planted = wide_tree.WideTree(), False

@@ -227,7 +227,7 @@ class Search:
         if self.device.is_cuda:
             blocks = -(-max(self.surface.count + triangles, self.watch.poses.size) // BLOCK)
             threads = BLOCK * min(max(blocks, 1), BLOCKS_EACH * self.device.sm_count)
-        inputs = [threads, int(first), int(last), asks, int(sleeps), self.surface.triangles]
+        inputs = [threads, int(first), int(last), asks, int(sleeps)]
         outputs = [rigid, self.watch, self.near, self._arrived]
         wp.launch(beside.search_near, threads, inputs, outputs, device=self.device, block_dim=min(threads, BLOCK))
 

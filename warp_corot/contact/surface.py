@@ -245,6 +245,9 @@ class ContactSurface:
         self.edges, self.sides = (wp.empty(edge_start, dtype=wp.vec2i, device=device) for _ in range(2))
         self.corner_starts = wp.empty(count + 1, dtype=wp.int32, device=device)
         self.corners = wp.empty(3 * triangle_start, dtype=wp.int32, device=device)
+        for name in ("triangles", "opposite", "warmth", "edges", "sides", "corner_starts", "corners"):
+            setattr(self.arrays, name, getattr(self, name))
+        self.arrays.body = wp.array(self.body_of_places(), dtype=wp.int32, device=device)
         self.places = [wp.empty(len(body.state.rest), dtype=wp.int32, device=device) for body in self.bodies]
         self.revision += 1
         self._fill()

@@ -102,7 +102,7 @@ class BodySteps:
         before: Velocities before the last step, for the guess of the next one, vec4; NaN before the first.
         begins: Nonzero if this is a first step, int32 [1].
         touched: What each node has touched, in schemes of second order, else empty, int32; see
-            ``kernels.contact.onsets``.
+            ``kernels.contact.bearing``.
         preconditioner: That of its own matrix.
         newton: Newton's method, or the residual of a linearisation.
     """
