@@ -5,48 +5,36 @@ A row is a contact: its normal times the share of each node that carries it. N h
 
 import warp as wp
 
-from warp_corot.kernels.elements.elements import load_node, store_node
+from warp_corot.kernels.elements.elements import add_force, load_node
+from warp_corot.kernels.stepping.sums import dot64
 
 wp.set_module_options({"enable_backward": False})
 
 
 @wp.struct
 class Rows:
-    """Contacts of rows, and the same of nodes.
+    """Entries of N and of the matrix G that the turning of normals adds, at free nodes.
 
     Attributes:
-        starts: Where the entries of each row begin, int32 [m + 1].
-        nodes, parts: The node of each entry, and the normal times its share.
-        touched: Nodes with entries, int32 [t]; node_starts, of_node: where their entries begin, int32 [t + 1], and
-            which they are.
-        row: The row of each entry.
+        row, node, part: The row and the node of each entry, and the normal times the node's share.
         inverse: The inverse of N^T N, float64 [m, m].
-        block_starts, block_nodes, blocks: The matrix that the turning of normals adds, by touched nodes [N/m].
+        first, second, block: The nodes of each 3x3 block of G, which may repeat, and the block [N/m].
     """
 
-    starts: wp.array[wp.int32]
-    nodes: wp.array[wp.int32]
-    parts: wp.array[wp.vec3]
-    touched: wp.array[wp.int32]
-    node_starts: wp.array[wp.int32]
-    of_node: wp.array[wp.int32]
     row: wp.array[wp.int32]
+    node: wp.array[wp.int32]
+    part: wp.array[wp.vec3]
     inverse: wp.array2d[wp.float64]
-    block_starts: wp.array[wp.int32]
-    block_nodes: wp.array[wp.int32]
-    blocks: wp.array[wp.mat33]
+    first: wp.array[wp.int32]
+    second: wp.array[wp.int32]
+    block: wp.array[wp.mat33]
 
 
 @wp.kernel(enable_backward=False)
 def measure_rows(rows: Rows, x: wp.array[wp.vec4], along: wp.array[wp.float64]):
-    """N^T x."""
-    i = wp.tid()
-    total = wp.float64(0.0)
-    for k in range(rows.starts[i], rows.starts[i + 1]):
-        part, value = rows.parts[k], load_node(x, rows.nodes[k])
-        for axis in range(3):
-            total += wp.float64(part[axis]) * wp.float64(value[axis])
-    along[i] = total
+    """Add N^T x."""
+    k = wp.tid()
+    wp.atomic_add(along, rows.row[k], dot64(rows.part[k], load_node(x, rows.node[k])))
 
 
 @wp.kernel(enable_backward=False)
@@ -62,21 +50,12 @@ def share_rows(rows: Rows, along: wp.array[wp.float64], shared: wp.array[wp.floa
 @wp.kernel(enable_backward=False)
 def remove_rows(rows: Rows, shared: wp.array[wp.float64], x: wp.array[wp.vec4]):
     """x - N times the rows' shares."""
-    t = wp.tid()
-    node = rows.touched[t]
-    left = wp.vec3d(load_node(x, node))
-    for at in range(rows.node_starts[t], rows.node_starts[t + 1]):
-        k = rows.of_node[at]
-        left -= shared[rows.row[k]] * wp.vec3d(rows.parts[k])
-    store_node(x, node, wp.vec3(left))
+    k = wp.tid()
+    add_force(x, rows.node[k], -float(shared[rows.row[k]]) * rows.part[k])
 
 
 @wp.kernel(enable_backward=False)
 def add_turning(rows: Rows, x: wp.array[wp.vec4], y: wp.array[wp.vec4]):
     """y + G x, with the change G of the forces of contact as their normals turn."""
-    t = wp.tid()
-    node = rows.touched[t]
-    sums = load_node(y, node)
-    for k in range(rows.block_starts[t], rows.block_starts[t + 1]):
-        sums += rows.blocks[k] * load_node(x, rows.block_nodes[k])
-    store_node(y, node, sums)
+    k = wp.tid()
+    add_force(y, rows.first[k], rows.block[k] * load_node(x, rows.second[k]))

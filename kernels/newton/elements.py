@@ -32,6 +32,8 @@ from warp_corot.kernels.modules import unique_kernel
 from warp_corot.kernels.stepping.pace import GROWTH, LEAST, SAFE, STABLE, STRAIN, safe_step
 from warp_corot.kernels.stepping.stability import TURNS, keep_largest
 
+from .particles import Particles
+
 wp.set_module_options({"enable_backward": False})
 
 #: The place of the largest speed among measurements.
@@ -219,8 +221,7 @@ def write_attributes(
 def find_posed_strains(
     # In
     elements: GeneralElements,
-    q: wp.array[wp.vec3],
-    qd: wp.array[wp.vec3],
+    particles: Particles,
     ahead: float,
     count: int,
     turn: wp.array[wp.int32],
@@ -232,16 +233,16 @@ def find_posed_strains(
     t = wp.tid() * TURNS + turn[0] % TURNS
     if t >= count:
         return
-    f = difference_gradient(elements, t, q)
+    f = difference_gradient(elements, t, particles.q)
     strain = wp.transpose(f) * f - identity3()
-    rate = wp.transpose(f) * difference_gradient(elements, t, qd)
+    rate = wp.transpose(f) * difference_gradient(elements, t, particles.qd)
     later = strain + ahead * (rate + wp.transpose(rate))
     most = float(0.0)
     for i in range(3):
         for j in range(3):
             most = wp.max(most, wp.max(wp.abs(strain[i, j]), wp.abs(later[i, j])))
     keep_largest(most, STRAIN, found[0])
-    keep_largest(wp.length(qd[elements.nodes[t][0]]), SPEED, found[0])
+    keep_largest(wp.length(particles.qd[elements.nodes[t][0]]), SPEED, found[0])
 
 
 @wp.func

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
-from scipy.sparse import coo_array, csr_array
+from scipy.sparse import csc_array, csr_array
 
 from warp_corot.contact.shapes import Ground, Shape, Sphere, axis_of
 from warp_corot.errors import InputError
 
-from .contact import Column, RestingContact
+from .contact import Column, RestingContact, normals_of, turning_of
 
 Array = npt.NDArray[np.float64]
 
@@ -46,24 +46,18 @@ class PreciseContact:
         """The gaps at displacements u [m], [m]."""
         return np.array([self._at(column, u)[0] for column in self._columns])
 
-    def normals(self, u: Array) -> csr_array:
+    def normals(self, u: Array) -> csc_array:
         """N, [3 N, m]."""
-        blocks = [np.outer(column.weights[0], self._at(column, u)[1]).ravel() for column in self._columns]
-        lines = [self._entries(column) for column in self._columns]
-        which = np.repeat(np.arange(self.count), [len(each) for each in lines])
-        places = (np.concatenate(lines), which)
-        return coo_array((np.concatenate(blocks), places), shape=(u.size, self.count)).tocsr()
+        parts = [(self._nodes(column), np.outer(column.weights[0], self._at(column, u)[1])) for column in self._columns]
+        return normals_of(parts, len(self._rest))
 
     def turning(self, u: Array, pushes: Array) -> csr_array:
         """G, [3 N, 3 N]."""
-        lines, columns, values = [], [], []
+        blocks = []
         for column, push in zip(self._columns, pushes, strict=True):
-            own, w = self._entries(column), column.weights[0]
-            lines.append(np.repeat(own, len(own)))
-            columns.append(np.tile(own, len(own)))
-            values.append(np.kron(np.outer(w, w), -push * self._at(column, u)[2]).ravel())
-        lines_, columns_, values_ = (np.concatenate(each) for each in (lines, columns, values))
-        return coo_array((values_, (lines_, columns_)), shape=(u.size, u.size)).tocsr()
+            shares = np.outer(column.weights[0], column.weights[0])
+            blocks.append((self._nodes(column), shares[:, :, None, None] * (-push * self._at(column, u)[2])))
+        return turning_of(blocks, len(self._rest))
 
     def of_obstacles(self, u: Array, pushes: Array, motion: Array, multipliers: Array) -> Array:
         """The derivative with respect to the places of obstacles, [obstacles, 3], from an adjoint motion [N, 3]."""
@@ -77,9 +71,6 @@ class PreciseContact:
     def _nodes(self, column: Column) -> npt.NDArray[np.int64]:
         """The nodes that bear its place, numbered within the world."""
         return column.nodes % len(self._rest)
-
-    def _entries(self, column: Column) -> npt.NDArray[np.int64]:
-        return np.asarray((3 * self._nodes(column)[:, None] + np.arange(3)).ravel())
 
     def _at(self, column: Column, u: Array) -> tuple[float, Array, Array]:
         """The gap of a contact, and its first and second derivative with respect to the place; if friction holds this,

@@ -19,7 +19,7 @@ from .implicit import ImplicitSteps
 from .library import CouplingInterface, ModelView, SolverBase, Step, newton
 from .others import Others
 from .scene import STATE, attribute_of, register_custom_attributes
-from .steps import Recordings, Steps
+from .steps import Recordings, Report, Steps
 from .substeps import SAFETY, Following, check_substep, stable_steps
 from .tetrahedra import LAME, Tetrahedra
 
@@ -135,10 +135,10 @@ class SolverCorotated(SolverBase, CouplingInterface):
         self._given_stable_dt = stable_dt
         self.tetrahedra = Tetrahedra(model, lame, rotation_level)
         self._others = Others(model, rigid_solver, particle_contact)
-        self._contacts = Contacts(model, self_contact_margin, moves=self._others.has_bodies)
-        self._recordings = Recordings(self.device)
+        self._report, self._recordings = Report(model), Recordings(self.device)
+        self._contacts = Contacts(model, self._report, self_contact_margin, moves=self._others.has_bodies)
         self._is_implicit = integrator == "implicit"
-        parts = (model, self.tetrahedra, self._contacts, self._others, damping)
+        parts = (model, self.tetrahedra, self._contacts, self._others, self._report, damping)
         self._steps = ImplicitSteps(*parts) if self._is_implicit else Steps(*parts)
         follows = substeps is None and not self._is_implicit
         self._following = Following(model, self.tetrahedra) if follows else None
@@ -246,7 +246,7 @@ class SolverCorotated(SolverBase, CouplingInterface):
         reported = None if observables is None else observables.contact_f
         step, following = Step(state_in, state_out, control, contacts, dt, reported), self._following
         _check_step(step, self.model)
-        self._steps.report.check_earlier(following)
+        self._report.check_earlier(following)
         count = self._count_for(dt)
         self._steps.launch(step, count, following)
         self._recordings.follow(state_in, state_out)
@@ -275,7 +275,7 @@ class SolverCorotated(SolverBase, CouplingInterface):
                 stacklevel=2,
             )
         self._recordings.check()
-        self._steps.report.check(self.stable_dt, self._following)
+        self._report.check(self.stable_dt, self._following)
         if self._following is not None and self._following.was_recorded:
             self._following.recover()
 

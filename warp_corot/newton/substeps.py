@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import math
 from contextlib import AbstractContextManager, nullcontext
+from functools import partial
 
 import numpy as np
 import numpy.typing as npt
@@ -13,6 +14,7 @@ import warp as wp
 from warp_corot.elasticity import Corotated
 from warp_corot.errors import InputError
 from warp_corot.kernels.newton import elements as of_elements
+from warp_corot.kernels.newton.particles import Particles
 from warp_corot.kernels.stepping import stability
 from warp_corot.kernels.stepping.stability import add_scaled
 from warp_corot.mesh.topology import linked, node_pairs
@@ -148,6 +150,7 @@ class Following:
     def __init__(self, model: newton.Model, tetrahedra: Tetrahedra):
         self.model, self.tetrahedra = model, tetrahedra
         self.device = model.device
+        self._launch = partial(wp.launch, device=self.device)
         self._f = wp.zeros(model.particle_count, dtype=wp.vec4, device=self.device)
         self._found = wp.zeros((1, 3), dtype=wp.float32, device=self.device)
         self._curvature = Curvature(model.particle_count, self._found[0])
@@ -208,11 +211,11 @@ class Following:
         self._since = 1 if due else self._since + 1
         return due
 
-    def measure(self, state: newton.State, dt: float, substep: float) -> None:
+    def measure(self, particles: Particles, dt: float, substep: float) -> None:
         """Measure at a state whose displacements have been gathered.
 
         Args:
-            state: The state.
+            particles: The particles in it.
             dt: The remaining time of the step [s].
             substep: The planned length of a substep [s].
         """
@@ -221,13 +224,13 @@ class Following:
         tets.add_elastic_forces(tets.u, self._f)
         self._curvature.find(tets.add_elastic_forces, self._inverse_mass, tets.u, self._f, model.particle_count)
         ahead = max(dt, INTERVAL * substep)
-        inputs = [tets.elements, state.particle_q, state.particle_qd, ahead, model.tet_count, self._turn]
+        inputs = [tets.elements, particles, ahead, model.tet_count, self._turn]
         looked_at = -(-model.tet_count // int(stability.TURNS))
-        self._launch(of_elements.find_posed_strains, inputs, [self._found], looked_at)
+        self._launch(of_elements.find_posed_strains, looked_at, inputs, [self._found])
         recorded = substep if self.device.is_capturing else 0.0
         inputs = [self._at_rest, wp.float64(recorded), self._stride, self._falls]
         outputs = [self._found, self._allowed, self._turn, self._excess, self._seen.array]
-        self._launch(of_elements.take_safe_substep, inputs, outputs, 1)
+        self._launch(of_elements.take_safe_substep, 1, inputs, outputs)
         self.recover()
 
     def recover(self) -> None:
@@ -240,9 +243,6 @@ class Following:
         if excess > 0.0:
             self._excess.zero_()
         return excess
-
-    def _launch(self, kernel: wp.Kernel, inputs: list, outputs: list, dim: int) -> None:
-        wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)
 
 
 def _size(model: newton.Model, tets: npt.NDArray[np.integer]) -> float:
