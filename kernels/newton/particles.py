@@ -10,7 +10,7 @@ from typing import Any
 
 import warp as wp
 
-from warp_corot.kernels.elements.elements import add_force, load_node, store_node
+from warp_corot.kernels.elements.elements import load_node, store_node
 from warp_corot.kernels.stepping.integrate import is_finite
 
 wp.set_module_options({"enable_backward": False})
@@ -219,24 +219,6 @@ def add_changes(dt: float, particles: Particles, after: wp.array[wp.vec3], f: wp
     if is_moved(i, particles):
         change = (after[i] - particles.qd[i]) / dt - in_world(particles, i, particles.gravity)
         store_node(f, i, load_node(f, i) + change / particles.inv_mass[i])
-
-
-@wp.kernel(enable_backward=False)
-def scatter_blocks(
-    # In
-    pairs: wp.array[wp.vec2i],
-    stiffness: wp.array[wp.mat33],
-    damping: wp.array[wp.mat33],
-    a: float,
-    b: float,
-    u: wp.array[wp.vec4],
-    # Out
-    f: wp.array[wp.vec4],
-):
-    """f -= (a K + b C) u of matrices that are given by blocks of pairs of particles, which may repeat."""
-    k = wp.tid()
-    pair = pairs[k]
-    add_force(f, pair[0], -(a * stiffness[k] + b * damping[k]) * load_node(u, pair[1]))
 
 
 # --- rigid bodies within a step, between the states that another solver gives ----------------------------------------

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -14,9 +14,10 @@ import warp as wp
 from warp_corot.contact.contacts import Contacts
 from warp_corot.contact.obstacles import measured_gaps
 from warp_corot.contact.reading import ActingRow, acting_rows
+from warp_corot.contact.shapes import Ground, Shape, Sphere, axis_of
 from warp_corot.errors import InputError
-from warp_corot.kernels.gradients import contact as kernels
-from warp_corot.solvers.implicit.operator import LinearOperator, Preconditioner
+from warp_corot.kernels.gradients import steps as kernels
+from warp_corot.kernels.implicit.tangent import add_products
 
 if TYPE_CHECKING:
     from scipy.sparse import csc_array, csr_array
@@ -176,16 +177,16 @@ class RestingContact:
         self, free: npt.NDArray[np.bool_], parts: tuple[Ints, Ints, Array], blocks: tuple[Ints, Ints, Array]
     ) -> None:
         """Give kernels N and G at free nodes."""
-        self._rows = rows = kernels.Rows()
-        self._launch = partial(wp.launch, device=self._body.device)
+        device, self._rows = self._body.device, kernels.Rows()
+        self._launch = partial(wp.launch, device=device)
         couples = free[blocks[0]] & free[blocks[1]] & blocks[2].any(axis=(1, 2))
-        found = [a[free[parts[1]]] for a in parts] + [self._inverse] + [a[couples] for a in blocks]
-        fields: Any = kernels.Rows
-        for (name, variable), values in zip(fields.vars.items(), found, strict=True):
-            setattr(rows, name, wp.array(values, dtype=variable.type.dtype, device=self._body.device))
-        self._along, self._shared = (
-            wp.zeros(len(self.columns), dtype=wp.float64, device=self._body.device) for _ in range(2)
-        )
+        which, nodes, values = (a[free[parts[1]]] for a in parts)
+        self._rows.row, self._rows.node = (wp.array(a, dtype=wp.int32, device=device) for a in (which, nodes))
+        self._rows.part = wp.array(values, dtype=wp.vec3, device=device)
+        self._rows.inverse = wp.array(self._inverse, dtype=wp.float64, device=device)
+        kinds = (wp.int32, wp.int32, wp.mat33)
+        self._couplings = [wp.array(a[couples], dtype=k, device=device) for a, k in zip(blocks, kinds, strict=True)]
+        self._along, self._shared = (wp.zeros(len(self.columns), dtype=wp.float64, device=device) for _ in range(2))
 
     # --- on the device -----------------------------------------------------------------------------------------------
 
@@ -198,7 +199,7 @@ class RestingContact:
 
     def launch_turning(self, x: wp.array, y: wp.array) -> None:
         """Launch y + G x."""
-        self._launch(kernels.add_turning, len(self._rows.block), [self._rows, x, y])
+        self._launch(add_products, len(self._couplings[0]), [*self._couplings, x, y])
 
     # --- on the host -------------------------------------------------------------------------------------------------
 
@@ -229,39 +230,78 @@ class RestingContact:
         return found
 
 
-class RestingOperator:
-    """S (A + G) of an operator A, for vectors in the range of the projector S that keeps to obstacles."""
+class PreciseContact:
+    """The contacts of one world in float64.
 
-    def __init__(self, operator: LinearOperator, contact: RestingContact):
-        self._operator, self._contact = operator, contact
+    Args:
+        resting: The contacts in float32.
+        shapes: The obstacles.
+        rest: Rest positions of a world's nodes [m], [N, 3].
+        world: The world.
 
-    def __getattr__(self, name: str) -> object:
-        return getattr(self._operator, name)
+    Raises:
+        InputError: A contact is not one of a node, or a place on an own surface, with a ``Ground`` or a ``Sphere``.
+    """
 
-    def apply(self, x: wp.array, y: wp.array) -> None:
-        self._operator.apply(x, y)
-        self._contact.launch_turning(x, y)
-        self._contact.launch_free(y)
+    def __init__(self, resting: RestingContact, shapes: tuple[Shape, ...], rest: Array, world: int):
+        self._rest, self._shapes = rest, shapes
+        for column in resting.columns:
+            if column.row.obstacle < 0 or len(column.row.places) > 1:
+                raise InputError("precision is 'float64'; contact must be at nodes, with obstacles")
+            shape = shapes[column.row.obstacle]
+            if column.yields and not isinstance(shape, Ground | Sphere):
+                raise InputError(
+                    f"precision is 'float64'; obstacles must be Ground or Sphere, and {column.row.obstacle} is "
+                    f"{shape!r}"
+                )
+        self._columns = [column for column in resting.columns if int(column.nodes[0]) // len(rest) == world]
+        self.count = len(self._columns)
+        self.pushes = np.array([float(column.row.force @ column.normal) for column in self._columns])
 
+    def gaps(self, u: Array) -> Array:
+        """The gaps at displacements u [m], [m]."""
+        return np.array([self._at(column, u)[0] for column in self._columns])
 
-class RestingPreconditioner:
-    """S B S of a preconditioner B; ``update`` is B's."""
+    def normals(self, u: Array) -> csc_array:
+        """N, [3 N, m]."""
+        parts = [(self._nodes(column), np.outer(column.weights[0], self._at(column, u)[1])) for column in self._columns]
+        return normals_of(parts, len(self._rest))
 
-    def __init__(self, preconditioner: Preconditioner, contact: RestingContact):
-        self._preconditioner, self._contact = preconditioner, contact
-        self._r: wp.array | None = None
+    def turning(self, u: Array, pushes: Array) -> csr_array:
+        """G, [3 N, 3 N]."""
+        blocks = []
+        for column, push in zip(self._columns, pushes, strict=True):
+            shares = np.outer(column.weights[0], column.weights[0])
+            blocks.append((self._nodes(column), shares[:, :, None, None] * (-push * self._at(column, u)[2])))
+        return turning_of(blocks, len(self._rest))
 
-    def update(self, operator: LinearOperator) -> None:
-        self._preconditioner.update(operator)
+    def of_obstacles(self, u: Array, pushes: Array, motion: Array, multipliers: Array) -> Array:
+        """The derivative with respect to the places of obstacles, [obstacles, 3], from an adjoint motion [N, 3]."""
+        found = np.zeros((len(self._shapes), 3))
+        for column, push, multiplier in zip(self._columns, pushes, multipliers, strict=True):
+            _, normal, bend = self._at(column, u)
+            moved = column.weights[0] @ motion[self._nodes(column)]
+            found[column.row.obstacle] += multiplier * normal - push * bend @ moved
+        return found
 
-    def apply(self, r: wp.array, z: wp.array) -> None:
-        if self._r is None:
-            self._r = wp.zeros_like(r)
-        # Rounding moves residuals out of the range of S.
-        wp.copy(self._r, r)
-        self._contact.launch_free(self._r)
-        self._preconditioner.apply(self._r, z)
-        self._contact.launch_free(z)
+    def _nodes(self, column: Column) -> npt.NDArray[np.int64]:
+        """The nodes that bear its place, numbered within the world."""
+        return column.nodes % len(self._rest)
+
+    def _at(self, column: Column, u: Array) -> tuple[float, Array, Array]:
+        """The gap of a contact, and its first and second derivative with respect to the place; if friction holds this,
+        the distance along the direction from where that is."""
+        x = column.weights[0] @ (self._rest + u)[self._nodes(column)]
+        if not column.yields:
+            return float(column.normal @ (x - column.row.point)), column.normal, np.zeros((3, 3))
+        shape = self._shapes[column.row.obstacle]
+        away = x - shape.position
+        if isinstance(shape, Ground):
+            up = axis_of(shape.quaternion)
+            return float(up @ away), up, np.zeros((3, 3))
+        distance = float(np.linalg.norm(away))
+        normal = away / distance
+        return distance - shape.size[0], normal, (np.eye(3) - np.outer(normal, normal)) / distance
 
 
 # --- sparse matrices of contacts --------------------------------------------------------------------------------------
