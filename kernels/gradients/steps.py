@@ -4,12 +4,16 @@ A step of symplectic Euler is v' = c (v + dt (f(u) / m + g)), u' = u + dt v' at 
 Held nodes keep their velocity. From the adjoints u_, v_ of the state after a step, the state before gets
     q = v_ + dt u_,  p = c dt q / m,  v_ <- c q,  u_ <- u_ - K(u) p,
 at held nodes p = 0 and v_ <- q. Changes of forces in the step change J by p times them.
+
+Contact: vectors without the normals of contacts. A row is a contact: its normal times the share of each node that
+carries it. N has the rows as columns.
 """
 
 import warp as wp
 
-from warp_corot.kernels.elements.elements import load_node, store_node
+from warp_corot.kernels.elements.elements import add_force, load_node, store_node
 from warp_corot.kernels.stepping.integrate import symplectic_euler_velocity
+from warp_corot.kernels.stepping.sums import dot64
 
 wp.set_module_options({"enable_backward": False})
 
@@ -64,12 +68,6 @@ def begin_explicit_adjoint(
 
 
 @wp.kernel(enable_backward=False)
-def subtract(product: wp.array[wp.vec4], of_u: wp.array[wp.vec4]):
-    i = wp.tid()
-    store_node(of_u, i, load_node(of_u, i) - load_node(product, i))
-
-
-@wp.kernel(enable_backward=False)
 def add_of_mass(
     # In
     inverse_mass: wp.array[wp.float32],
@@ -83,3 +81,45 @@ def add_of_mass(
     i = wp.tid()
     force = load_node(f, i) + load_node(loads, i)
     of_mass[i] = of_mass[i] - wp.float64(inverse_mass[i] * wp.dot(force, load_node(p, i)))
+
+
+# --- contact ---------------------------------------------------------------------------------------------------------
+
+
+@wp.struct
+class Rows:
+    """Entries of N at free nodes.
+
+    Attributes:
+        row, node, part: The row and the node of each entry, and the normal times the node's share.
+        inverse: The inverse of N^T N, float64 [m, m].
+    """
+
+    row: wp.array[wp.int32]
+    node: wp.array[wp.int32]
+    part: wp.array[wp.vec3]
+    inverse: wp.array2d[wp.float64]
+
+
+@wp.kernel(enable_backward=False)
+def measure_rows(rows: Rows, x: wp.array[wp.vec4], along: wp.array[wp.float64]):
+    """Add N^T x."""
+    k = wp.tid()
+    wp.atomic_add(along, rows.row[k], dot64(rows.part[k], load_node(x, rows.node[k])))
+
+
+@wp.kernel(enable_backward=False)
+def share_rows(rows: Rows, along: wp.array[wp.float64], shared: wp.array[wp.float64]):
+    """(N^T N)^-1 times what rows measured."""
+    i = wp.tid()
+    total = wp.float64(0.0)
+    for j in range(along.shape[0]):
+        total += rows.inverse[i, j] * along[j]
+    shared[i] = total
+
+
+@wp.kernel(enable_backward=False)
+def remove_rows(rows: Rows, shared: wp.array[wp.float64], x: wp.array[wp.vec4]):
+    """x - N times the rows' shares."""
+    k = wp.tid()
+    add_force(x, rows.node[k], -float(shared[rows.row[k]]) * rows.part[k])

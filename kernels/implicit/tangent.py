@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from warp_corot.kernels.elements.elements import load_node, store_node
+from warp_corot.kernels.elements.elements import add_force, load_node, store_node
 from warp_corot.kernels.modules import unique_kernel
 
 wp.set_module_options({"enable_backward": False})
@@ -85,6 +85,19 @@ def apply_blocks(blocks: wp.array[wp.mat33], r: wp.array[wp.vec4], z: wp.array[w
     """z = B r, block by block."""
     i = wp.tid()
     store_node(z, i, blocks[i] * load_node(r, i))
+
+
+@wp.kernel(enable_backward=False)
+def add_products(
+    first: wp.array[wp.int32],
+    second: wp.array[wp.int32],
+    blocks: wp.array[wp.mat33],
+    x: wp.array[wp.vec4],
+    y: wp.array[wp.vec4],
+):
+    """y += A x of blocks of A at pairs of nodes, which may repeat."""
+    k = wp.tid()
+    add_force(y, first[k], blocks[k] * load_node(x, second[k]))
 
 
 @wp.kernel(enable_backward=False)

@@ -32,6 +32,8 @@ from warp_corot.kernels.modules import unique_kernel
 from warp_corot.kernels.stepping.pace import GROWTH, LEAST, SAFE, STABLE, STRAIN, safe_step
 from warp_corot.kernels.stepping.stability import TURNS, keep_largest
 
+from .particles import Particles
+
 wp.set_module_options({"enable_backward": False})
 
 #: The place of the largest speed among measurements.
@@ -212,36 +214,40 @@ def write_attributes(
         equivalent[t] = von_mises(stress)
 
 
-# --- current stiffness, as ``stepping.gauge`` ------------------------------------------------------------------------
+# --- current stiffness, as ``stepping.stability`` --------------------------------------------------------------------
+
+
+@wp.struct
+class SafeSubstep:
+    """The substep that is safe in the present state, and what measurements need."""
+
+    stride: float  # the longest way of a particle in a substep [m], which may meet something, or zero
+    falls: float  # how much faster it may be at the next measurement, over the substep [m/s^2]
+    at_rest: wp.array2d[wp.float64]  # [1, 4], see ``stepping.pace``
+    found: wp.array2d[wp.float32]  # [1, 3] curvature, strain and speed
+    allowed: wp.array[wp.float64]  # [1] the safe substep [s]
+    turn: wp.array[wp.int32]  # [1] number of the measurement
+    excess: wp.array[wp.float32]  # [1] largest factor by which a recorded substep was too long
+    seen: wp.array[wp.float64]  # [1] the safe substep, in the host's memory
 
 
 @wp.kernel(enable_backward=False)
-def find_posed_strains(
-    # In
-    elements: GeneralElements,
-    q: wp.array[wp.vec3],
-    qd: wp.array[wp.vec3],
-    ahead: float,
-    count: int,
-    turn: wp.array[wp.int32],
-    # Out
-    found: wp.array2d[wp.float32],
-):
+def find_posed_strains(elements: GeneralElements, particles: Particles, ahead: float, count: int, safe: SafeSubstep):
     """The largest entry of F^T F - I among one in ``TURNS`` elements, now and after ``ahead`` [s] at the current rate,
     and the largest speed of their first nodes; the next measurement checks others."""
-    t = wp.tid() * TURNS + turn[0] % TURNS
+    t = wp.tid() * TURNS + safe.turn[0] % TURNS
     if t >= count:
         return
-    f = difference_gradient(elements, t, q)
+    f = difference_gradient(elements, t, particles.q)
     strain = wp.transpose(f) * f - identity3()
-    rate = wp.transpose(f) * difference_gradient(elements, t, qd)
+    rate = wp.transpose(f) * difference_gradient(elements, t, particles.qd)
     later = strain + ahead * (rate + wp.transpose(rate))
     most = float(0.0)
     for i in range(3):
         for j in range(3):
             most = wp.max(most, wp.max(wp.abs(strain[i, j]), wp.abs(later[i, j])))
-    keep_largest(most, STRAIN, found[0])
-    keep_largest(wp.length(qd[elements.nodes[t][0]]), SPEED, found[0])
+    keep_largest(most, STRAIN, safe.found[0])
+    keep_largest(wp.length(particles.qd[elements.nodes[t][0]]), SPEED, safe.found[0])
 
 
 @wp.func
@@ -251,37 +257,20 @@ def longest_stride(stride: float, falls: float, speed: float):
 
 
 @wp.kernel(enable_backward=False)
-def take_safe_substep(
-    # In
-    at_rest: wp.array2d[wp.float64],
-    recorded: wp.float64,
-    stride: float,
-    falls: float,
-    # In and out
-    found: wp.array2d[wp.float32],
-    allowed: wp.array[wp.float64],
-    turn: wp.array[wp.int32],
-    excess: wp.array[wp.float32],
-    # Out
-    seen: wp.array[wp.float64],
-):
-    """Find the substep that is safe until the next measurement [s]: it shrinks at once and grows slowly.
+def take_safe_substep(recorded: wp.float64, safe: SafeSubstep):
+    """Find the substep that is safe until the next measurement: it shrinks at once and grows slowly.
 
     Args:
         recorded: Length of the substep of a recorded step [s]; zero if the host chooses the next one.
-        stride: The longest way of a particle in a substep [m], which may meet something, or zero.
-        falls: How much faster it may be at the next measurement, over the substep [m/s^2].
-        excess: Largest factor by which a recorded one was too long.
-        seen: The safe substep, in the host's memory.
     """
-    longest = at_rest[0, SAFE] * at_rest[0, STABLE]
-    safe = wp.min(longest, safe_step(at_rest, found, 0))
-    if stride > 0.0:
-        safe = wp.min(safe, wp.float64(longest_stride(stride, falls, found[0, SPEED])))
-    safe = wp.min(wp.max(safe, LEAST * longest), GROWTH * allowed[0])
-    allowed[0] = safe
-    seen[0] = safe
-    excess[0] = wp.max(excess[0], float(recorded / safe))
-    for k in range(found.shape[1]):
-        found[0, k] = 0.0
-    turn[0] = (turn[0] + 1) % TURNS
+    longest = safe.at_rest[0, SAFE] * safe.at_rest[0, STABLE]
+    allowed = wp.min(longest, safe_step(safe.at_rest, safe.found, 0))
+    if safe.stride > 0.0:
+        allowed = wp.min(allowed, wp.float64(longest_stride(safe.stride, safe.falls, safe.found[0, SPEED])))
+    allowed = wp.min(wp.max(allowed, LEAST * longest), GROWTH * safe.allowed[0])
+    safe.allowed[0] = allowed
+    safe.seen[0] = allowed
+    safe.excess[0] = wp.max(safe.excess[0], float(recorded / allowed))
+    for k in range(safe.found.shape[1]):
+        safe.found[0, k] = 0.0
+    safe.turn[0] = (safe.turn[0] + 1) % TURNS

@@ -142,8 +142,6 @@ def scatter_rows(
     load: wp.array[wp.float32],
     particles: Particles,
     bodies: Bodies,
-    q: wp.array[wp.vec3],
-    qd: wp.array[wp.vec3],
     before: wp.array[wp.vec4],
     # Out
     f: wp.array[wp.vec4],
@@ -177,8 +175,8 @@ def scatter_rows(
             turn = wp.quat_to_matrix(wp.transform_get_rotation(pose))
             m.linear = n * bodies.inv_mass[body]
             m.angular = n * (turn * bodies.inv_inertia[body] * wp.transpose(turn))
-    apart = sum_of(row, q) - point
-    v = sum_of(row, qd) - velocity
+    apart = sum_of(row, particles.q) - point
+    v = sum_of(row, particles.qd) - velocity
     force = wp.vec3()
     if is_attachment(row):
         force = attachment_force(row, apart, v, m, dt)
@@ -243,38 +241,38 @@ def outward_normal(surfaces: Surfaces, t: int, q: wp.array[wp.vec3]):
 @wp.func
 def margin_of(surfaces: Surfaces, i: int, j: int, margin: float, first: float):
     """The margin of a pair, with one particle of each side and the distance at first [m]."""
-    least = float(0.0)
-    if surfaces.part[i] != surfaces.part[j]:
-        least = LEAST * margin
+    least = wp.where(surfaces.part[i] != surfaces.part[j], LEAST * margin, 0.0)
     return wp.min(margin, wp.max(first, least))
+
+
+@wp.func
+def apart_from(v: int, n: wp.vec3i, x: wp.array[wp.vec3]):
+    """The closest point of a triangle to a vertex, as weights, and the vertex from there."""
+    w = on_triangle(x[v], x[n[0]], x[n[1]], x[n[2]])
+    return w, x[v] - w[0] * x[n[0]] - w[1] * x[n[1]] - w[2] * x[n[2]]
 
 
 @wp.func
 def vertex_row(surfaces: Surfaces, v: int, t: int, margin: float, q: wp.array[wp.vec3]):
     """A vertex and a triangle."""
     row = no_row()
-    i = surfaces.triangles[t, 0]
-    j = surfaces.triangles[t, 1]
-    k = surfaces.triangles[t, 2]
+    n = wp.vec3i(surfaces.triangles[t, 0], surfaces.triangles[t, 1], surfaces.triangles[t, 2])
     if surfaces.part[v] < 0:
         return row
-    w = on_triangle(q[v], q[i], q[j], q[k])
-    apart = q[v] - (w[0] * q[i] + w[1] * q[j] + w[2] * q[k])
+    w, apart = apart_from(v, n, q)
     distance = wp.length(apart)
     out = outward_normal(surfaces, t, q)
     sunk = bool(False)
-    if surfaces.facing[t] != 0.0 and surfaces.part[v] != surfaces.part[i]:
+    if surfaces.facing[t] != 0.0 and surfaces.part[v] != surfaces.part[n[0]]:
         sunk = wp.dot(apart, out) < 0.0
         if sunk and wp.min(w) < INSIDE:
             # Beside the triangle: another one faces the vertex.
             return row
     row.measure = 1.0
-    row.nodes = wp.vec4i(v, i, j, k)
+    row.nodes = wp.vec4i(v, n[0], n[1], n[2])
     row.weights = wp.vec4(1.0, -w[0], -w[1], -w[2])
-    x = surfaces.rest
-    w = on_triangle(x[v], x[i], x[j], x[k])
-    first = wp.length(x[v] - w[0] * x[i] - w[1] * x[j] - w[2] * x[k])
-    row.offset = margin_of(surfaces, v, i, margin, first)
+    _w, first = apart_from(v, n, surfaces.rest)
+    row.offset = margin_of(surfaces, v, n[0], margin, wp.length(first))
     row.normal = wp.normalize(out)
     if distance > COINCIDENT:
         row.normal = apart / distance
@@ -298,35 +296,32 @@ def points_out(surfaces: Surfaces, e: int, direction: wp.vec3, q: wp.array[wp.ve
 def edge_row(surfaces: Surfaces, e: int, other: int, margin: float, parallel: float, q: wp.array[wp.vec3]):
     """Two edges."""
     row = no_row()
-    i = surfaces.edges[e, 2]
-    j = surfaces.edges[e, 3]
-    k = surfaces.edges[other, 2]
-    m = surfaces.edges[other, 3]
-    found = wp.closest_point_edge_edge(q[i], q[j], q[k], q[m], parallel)
+    n = wp.vec4i(surfaces.edges[e, 2], surfaces.edges[e, 3], surfaces.edges[other, 2], surfaces.edges[other, 3])
+    found = wp.closest_point_edge_edge(q[n[0]], q[n[1]], q[n[2]], q[n[3]], parallel)
     s = found[0]
     t = found[1]
-    apart = q[i] + s * (q[j] - q[i]) - q[k] - t * (q[m] - q[k])
+    apart = q[n[0]] + s * (q[n[1]] - q[n[0]]) - q[n[2]] - t * (q[n[3]] - q[n[2]])
     distance = wp.length(apart)
     if distance < COINCIDENT:
         return row
     row.measure = 16.0 * s * (1.0 - s) * t * (1.0 - t)
-    row.nodes = wp.vec4i(i, j, k, m)
+    row.nodes = n
     row.weights = wp.vec4(1.0 - s, s, t - 1.0, -t)
     row.normal = apart / distance
-    if surfaces.part[i] != surfaces.part[k]:
+    if surfaces.part[n[0]] != surfaces.part[n[2]]:
         one = points_out(surfaces, e, -row.normal, q)
         two = points_out(surfaces, other, row.normal, q)
         if one + two < 0.0 and one <= 0.0 and two <= 0.0:
             row.normal = -row.normal
     x = surfaces.rest
-    first = wp.closest_point_edge_edge(x[i], x[j], x[k], x[m], parallel)[2]
-    row.offset = margin_of(surfaces, i, k, margin, first)
+    first = wp.closest_point_edge_edge(x[n[0]], x[n[1]], x[n[2]], x[n[3]], parallel)[2]
+    row.offset = margin_of(surfaces, n[0], n[2], margin, first)
     return row
 
 
 @wp.func
-def row_size(starts: wp.array[wp.int32], counts: wp.array[wp.int32], n: int):
-    """Number of pairs that row n of a list holds, no more than fit, and whether more were found."""
+def pair_count(starts: wp.array[wp.int32], counts: wp.array[wp.int32], n: int):
+    """Number of pairs in row n of a list, and whether more were found than it has room for."""
     if n >= counts.shape[0]:
         return 0, False
     room = starts[n + 1] - starts[n]
@@ -334,23 +329,24 @@ def row_size(starts: wp.array[wp.int32], counts: wp.array[wp.int32], n: int):
 
 
 @wp.func
-def row_sizes(lists: PairLists, n: int):
+def pair_counts(lists: PairLists, n: int):
     """The same of vertex n and of edge n."""
-    in_triangles, lacks = row_size(lists.vertex_colliding_triangles_offsets, lists.vertex_colliding_triangles_count, n)
-    in_edges, lacks_edges = row_size(lists.edge_colliding_edges_offsets, lists.edge_colliding_edges_count, n)
-    return in_triangles, lacks, in_edges, lacks_edges
+    of_vertex, lacks = pair_count(lists.vertex_colliding_triangles_offsets, lists.vertex_colliding_triangles_count, n)
+    of_edge, lacks_edges = pair_count(lists.edge_colliding_edges_offsets, lists.edge_colliding_edges_count, n)
+    return of_vertex, of_edge, lacks, lacks_edges
 
 
 @wp.func
-def listed_row(surfaces: Surfaces, lists: PairLists, law: ContactLaw, n: int, c: int, q: wp.array[wp.vec3]):
-    """The c-th pair in the rows of vertex n and edge n, if it touches, and its gap. Two edges are listed twice."""
-    in_triangles, _lacks, _in_edges, _lacks_edges = row_sizes(lists, n)
+def listed_row(
+    surfaces: Surfaces, lists: PairLists, law: ContactLaw, n: int, c: int, of_vertex: int, q: wp.array[wp.vec3]
+):
+    """The c-th pair of those of vertex n and then those of edge n, and its gap. Two edges are listed twice."""
     row = no_row()
-    if c < in_triangles:
+    if c < of_vertex:
         t = lists.vertex_colliding_triangles[2 * (lists.vertex_colliding_triangles_offsets[n] + c) + 1]
         row = vertex_row(surfaces, n, t, lists.margin, q)
     else:
-        other = lists.edge_colliding_edges[2 * (lists.edge_colliding_edges_offsets[n] + c - in_triangles) + 1]
+        other = lists.edge_colliding_edges[2 * (lists.edge_colliding_edges_offsets[n] + c - of_vertex) + 1]
         if n < other:
             row = edge_row(surfaces, n, other, lists.margin, lists.parallel, q)
     gap = float(1.0)
@@ -365,19 +361,17 @@ def listed_row(surfaces: Surfaces, lists: PairLists, law: ContactLaw, n: int, c:
 
 @wp.kernel(enable_backward=False)
 def count_pair_loads(
-    # In
-    surfaces: Surfaces,
-    lists: PairLists,
-    law: ContactLaw,
-    q: wp.array[wp.vec3],
-    # In and out
-    load: wp.array[wp.float32],
+    surfaces: Surfaces, lists: PairLists, law: ContactLaw, particles: Particles, load: wp.array[wp.float32]
 ):
-    """Add twice the weights of all pairs that touch."""
+    """Add twice the weights of all pairs that touch. A list that holds fewer pairs than were found marks the world."""
     n = wp.tid()
-    in_triangles, _lacks, in_edges, _lacks_edges = row_sizes(lists, n)
-    for c in range(in_triangles + in_edges):
-        row, gap = listed_row(surfaces, lists, law, n, c, q)
+    of_vertex, of_edge, lacks, lacks_edges = pair_counts(lists, n)
+    if lacks:
+        mark(n, TOO_MANY_PAIRS, particles)
+    if lacks_edges:
+        mark(surfaces.edges[n, 2], TOO_MANY_PAIRS, particles)
+    for c in range(of_vertex + of_edge):
+        row, gap = listed_row(surfaces, lists, law, n, c, of_vertex, particles.q)
         if gap < 0.0:
             add_load(row, 2.0, load)
 
@@ -391,24 +385,17 @@ def scatter_pairs(
     dt: float,
     load: wp.array[wp.float32],
     particles: Particles,
-    q: wp.array[wp.vec3],
-    qd: wp.array[wp.vec3],
     before: wp.array[wp.vec4],
     # Out
     f: wp.array[wp.vec4],
-    trouble: wp.array[wp.int32],
 ):
-    """Forces of all pairs. A row that holds fewer pairs than were found marks the world."""
+    """Forces of all pairs."""
     n = wp.tid()
-    in_triangles, lacks, in_edges, lacks_edges = row_sizes(lists, n)
-    if lacks:
-        mark(n, TOO_MANY_PAIRS, particles, trouble)
-    if lacks_edges:
-        mark(surfaces.edges[n, 2], TOO_MANY_PAIRS, particles, trouble)
-    for c in range(in_triangles + in_edges):
-        row, gap = listed_row(surfaces, lists, law, n, c, q)
+    of_vertex, of_edge, _lacks, _lacks_edges = pair_counts(lists, n)
+    for c in range(of_vertex + of_edge):
+        row, gap = listed_row(surfaces, lists, law, n, c, of_vertex, particles.q)
         if gap < 0.0:
             m = Mobility()
             m.particle = inverse_mass_of(row, load, particles)
-            force = contact_force(row, gap, sum_of(row, qd), pull_of(row, dt, particles, before), m, dt)
-            add_to_particles(row, force, f)
+            pull = pull_of(row, dt, particles, before)
+            add_to_particles(row, contact_force(row, gap, sum_of(row, particles.qd), pull, m, dt), f)

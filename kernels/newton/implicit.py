@@ -23,7 +23,7 @@ from typing import Any
 
 import warp as wp
 
-from warp_corot.kernels.contact.law import LOOSE, across, bound_of
+from warp_corot.kernels.contact.law import LOOSE, SpringState, across, bound_of
 from warp_corot.kernels.corotated.tangent import keep_gradients
 from warp_corot.kernels.elements.constitutive import hooke, symmetric
 from warp_corot.kernels.elements.elements import GeneralElements, add_force, load_node, store_node
@@ -34,17 +34,7 @@ from warp_corot.kernels.math.rotation import byers_xu, identity3
 from warp_corot.kernels.stepping.sums import Sums, store_sum
 
 from .elements import difference_gradient
-from .particles import (
-    SOUND,
-    Bodies,
-    Particles,
-    gravity_of,
-    is_active,
-    is_fixed,
-    is_moved,
-    place_of,
-    trouble_of,
-)
+from .particles import SOUND, Bodies, Particles, in_world, is_active, is_fixed, is_moved
 from .rows import ContactLaw, Row, ease_off, gap_of, is_attachment, point_and_arm, sum_of
 
 wp.set_module_options({"enable_backward": False})
@@ -104,104 +94,89 @@ def add_element_blocks(elements: GeneralElements, made: Linearised, blocks: wp.a
         wp.atomic_add(blocks, elements.nodes[t][k], elements.volume[t] * block)
 
 
+@wp.struct
+class Unknowns:
+    """Vectors of a solve: an entry for each particle, and two for each body, world after world."""
+
+    count: int  # entries of a world
+    particle: wp.array[wp.int32]  # the entry of each particle
+    body: wp.array[wp.int32]  # of each body's translation, before that of its rotation
+    owner: wp.array[wp.int32]  # the body of an entry, or -1
+    mass: wp.array[wp.float32]  # inertia [kg/s^2], zero if an entry is not free
+    roots: wp.array[wp.mat33]  # G of each body, with G G^T its inverse inertia times a mean moment of inertia
+    b: wp.array[wp.vec4]  # the right side
+    d: wp.array[wp.vec4]  # the motions
+    way: wp.array[wp.vec4]  # to where elements are linearised [m]
+    fall: wp.array[wp.vec4]  # the guess of how gravity changes motions
+
+
+@wp.func
+def begin_entry(unknowns: Unknowns, k: int, mass: float, right: wp.vec3, motion: wp.vec3, fall: wp.vec3):
+    """The right side of what is not free is its motion."""
+    unknowns.mass[k] = mass
+    store_node(unknowns.b, k, right)
+    store_node(unknowns.d, k, motion)
+    store_node(unknowns.fall, k, fall)
+
+
 @wp.kernel(enable_backward=False)
-def begin_particles(
-    # In
-    dt: float,
-    damping: float,
-    particles: Particles,
-    f: wp.array[wp.vec4],
-    qd: wp.array[wp.vec3],
-    trouble: wp.array[wp.int32],
-    entry: wp.array[wp.int32],
-    # In and out
-    b: wp.array[wp.vec4],
-    # Out
-    mass: wp.array[wp.float32],
-    d: wp.array[wp.vec4],
-    fall: wp.array[wp.vec4],
-):
-    """Inertia of particles [kg/s^2], their right side, in addition to K times the way, their first motion, and the
-    guess of how gravity changes that: a solve to a share of large forces would not find that a body falls freely.
-    Nothing moves in worlds that have failed. The right side of what is not free is its motion."""
+def begin_particles(dt: float, damping: float, particles: Particles, f: wp.array[wp.vec4], unknowns: Unknowns):
+    """Inertia of particles, their right side, in addition to K times the way, their first motion, and the guess of how
+    gravity changes that: a solve to a share of large forces would not find that a body falls freely. Nothing moves in
+    worlds that have failed."""
     i = wp.tid()
-    k = entry[i]
-    mass[k] = 0.0
+    k = unknowns.particle[i]
     motion = wp.vec3()
-    falls = wp.vec3()
-    if trouble_of(i, particles, trouble) == SOUND and is_active(i, particles):
-        motion = dt * qd[i]
-    right = wp.vec3(motion)
-    if is_moved(i, particles) and trouble_of(i, particles, trouble) == SOUND:
-        m = 1.0 / particles.inv_mass[i]
-        g = gravity_of(i, particles)
-        mass[k] = m * (1.0 / dt + damping) / dt
-        right = load_node(b, k) + (m / dt) * qd[i] + load_node(f, i) + m * g
-        motion = motion / (1.0 + dt * damping)
-        falls = (dt * dt / (1.0 + dt * damping)) * g
-    store_node(b, k, right)
-    store_node(d, k, motion)
-    store_node(fall, k, falls)
+    if in_world(particles, i, particles.trouble) != SOUND or not is_active(i, particles):
+        begin_entry(unknowns, k, 0.0, motion, motion, motion)
+        return
+    motion = dt * particles.qd[i]
+    if particles.inv_mass[i] == 0.0:
+        begin_entry(unknowns, k, 0.0, motion, motion, wp.vec3())
+        return
+    m = 1.0 / particles.inv_mass[i]
+    g = in_world(particles, i, particles.gravity)
+    right = load_node(unknowns.b, k) + (m / (dt * dt)) * motion + load_node(f, i) + m * g
+    damped = 1.0 + dt * damping
+    begin_entry(unknowns, k, m * damped / (dt * dt), right, motion / damped, (dt * dt / damped) * g)
 
 
 @wp.kernel(enable_backward=False)
-def begin_bodies(
-    # In
-    dt: float,
-    bodies: Bodies,
-    gravity: wp.array[wp.vec3],
-    body_f: wp.array[wp.spatial_vector],
-    moves: int,
-    trouble: wp.array[wp.int32],
-    entry: wp.array[wp.int32],
-    # Out
-    b: wp.array[wp.vec4],
-    mass: wp.array[wp.float32],
-    d: wp.array[wp.vec4],
-    fall: wp.array[wp.vec4],
-    roots: wp.array[wp.mat33],
-):
+def begin_bodies(dt: float, bodies: Bodies, body_f: wp.array[wp.spatial_vector], moves: int, unknowns: Unknowns):
     """The same of bodies, as if nothing but soft bodies, gravity and ``body_f`` acted on them.
 
     Args:
         moves: Whether bodies move by their own velocities; else they stay.
-        roots: G of each body, with G G^T its inverse inertia times a mean moment of inertia.
     """
     i = wp.tid()
-    k = entry[i]
+    k = unknowns.body[i]
     linear = wp.vec3()
     angular = wp.vec3()
     w = float(0.0)
-    if trouble[place_of(bodies.world[i], trouble.shape[0])] == SOUND and moves != 0:
+    if in_world(bodies, i, bodies.trouble) == SOUND and moves != 0:
         linear = dt * wp.spatial_top(bodies.qd[i])
         angular = dt * wp.spatial_bottom(bodies.qd[i])
         if not is_fixed(i, bodies):
             w = bodies.inv_mass[i]
-    for part in range(2):
-        mass[k + part] = 0.0
-        store_node(fall, k + part, wp.vec3())
+    begin_entry(unknowns, k, 0.0, linear, linear, wp.vec3())
     root = wp.identity(3, dtype=wp.float32)
-    right = wp.vec3(linear)
-    right_turn = wp.vec3(angular)
+    inertia = float(0.0)
+    right = wp.vec3(angular)
     if w > 0.0:
-        g = gravity[place_of(bodies.world[i], gravity.shape[0])]
-        inertia = 1.0 / (w * dt * dt)
-        mass[k] = inertia
-        right = inertia * linear + wp.spatial_top(body_f[i]) + g / w
-        store_node(fall, k, (dt * dt) * g)
+        g = in_world(bodies, i, bodies.gravity)
+        mass = 1.0 / (w * dt * dt)
+        force = mass * linear + wp.spatial_top(body_f[i]) + g / w
+        begin_entry(unknowns, k, mass, force, linear, (dt * dt) * g)
         if wp.determinant(bodies.inv_inertia[i]) > 0.0:
             turn = wp.quat_to_matrix(wp.transform_get_rotation(bodies.q[i]))
             moment = 3.0 / wp.trace(bodies.inv_inertia[i])
             root = wp.sqrt(moment) * root_columns(turn * bodies.inv_inertia[i] * wp.transpose(turn))
-            mass[k + 1] = moment / (dt * dt)
+            inertia = moment / (dt * dt)
             spin = turn * (bodies.inertia[i] * (wp.transpose(turn) * angular))
             angular = (wp.transpose(root) * spin) / moment
-            right_turn = mass[k + 1] * angular + wp.transpose(root) * wp.spatial_bottom(body_f[i])
-    roots[i] = root
-    store_node(b, k, right)
-    store_node(b, k + 1, right_turn)
-    store_node(d, k, linear)
-    store_node(d, k + 1, angular)
+            right = inertia * angular + wp.transpose(root) * wp.spatial_bottom(body_f[i])
+    unknowns.roots[i] = root
+    begin_entry(unknowns, k + 1, inertia, right, angular, wp.vec3())
 
 
 # --- how free pieces turn in a step; see ``kernels.implicit.increments`` ----------------------------------------------
@@ -210,14 +185,7 @@ def begin_bodies(
 
 
 @wp.kernel(enable_backward=False)
-def sum_motion(
-    sums: Sums,
-    first: wp.array[wp.int32],
-    members: wp.array[wp.int32],
-    particles: Particles,
-    q: wp.array[wp.vec3],
-    qd: wp.array[wp.vec3],
-):
+def sum_motion(sums: Sums, first: wp.array[wp.int32], members: wp.array[wp.int32], particles: Particles):
     """Find parts of the sums of each piece, whose particles begin at ``first`` among the members."""
     piece, thread = wp.tid()
     total = Motion()
@@ -225,7 +193,7 @@ def sum_motion(
         i = members[k]
         if is_moved(i, particles):
             mass = wp.float64(1.0) / wp.float64(particles.inv_mass[i])
-            total += motion_of(mass, False, wp.vec3d(q[i]), wp.vec3d(qd[i]))
+            total += motion_of(mass, False, wp.vec3d(particles.q[i]), wp.vec3d(particles.qd[i]))
         else:
             total += motion_of(wp.float64(0.0), True, wp.vec3d(), wp.vec3d())
     for column in range(MOTION_COLUMNS):
@@ -236,26 +204,25 @@ def sum_motion(
 def turn_particles(
     # In
     piece_of: wp.array[wp.int32],
-    q: wp.array[wp.vec3],
     centres: wp.array[wp.vec3],
     turns: wp.array[wp.mat33],
-    entry: wp.array[wp.int32],
+    particles: Particles,
     # In and out
+    unknowns: Unknowns,
     u: wp.array[wp.vec4],
     # Out
     turned: wp.array[wp.vec3],
-    way: wp.array[wp.vec4],
 ):
     """Find the turned positions and the way to them; gathered displacements are turned, too."""
     i = wp.tid()
-    at = q[i]
+    at = particles.q[i]
     d = wp.vec3()
     piece = piece_of[i]
     if piece >= 0:
         d = turns[piece] * (at - centres[piece])
         store_node(u, i, load_node(u, i) + d)
     turned[i] = at + d
-    store_node(way, entry[i], d)
+    store_node(unknowns.way, unknowns.particle[i], d)
 
 
 # --- rows ------------------------------------------------------------------------------------------------------------
@@ -263,8 +230,10 @@ def turn_particles(
 
 @wp.struct
 class RowSprings:
-    """Rows, as functions of motions; those without a first node are none."""
+    """Rows, as functions of motions in a step dt; those without a first node are none."""
 
+    dt: float
+    adhesion: float  # see ``ContactLaw``
     nodes: wp.array[wp.vec4i]  # [R] entries of particles, -1 where there is none
     weights: wp.array[wp.vec4]  # [R]
     body: wp.array[wp.int32]  # [R] entry of the body's translation, before that of its rotation; -1: there is none
@@ -278,26 +247,23 @@ class RowSprings:
     force: wp.array[wp.vec3]  # [R] on the particles [N]
     most: wp.array[wp.float32]  # [R] bound of friction [N]
     solves: wp.array[wp.int32]  # [1] number of linear solves that the step has had so far
-    mass: wp.array[wp.float32]  # of each entry, zero if it is not free
 
 
 @wp.kernel(enable_backward=False)
 def begin_springs(
     # In
-    dt: float,
     law: ContactLaw,
-    rows: wp.array[Row],
-    q: wp.array[wp.vec3],
+    particles: Particles,
     bodies: Bodies,
-    particle_entry: wp.array[wp.int32],
-    body_entry: wp.array[wp.int32],
-    roots: wp.array[wp.mat33],
+    unknowns: Unknowns,
+    # In and out
+    rows: wp.array[Row],
     # Out
     springs: RowSprings,
 ):
     """Springs of rows at the beginning of a step."""
     c = wp.tid()
-    ease_off(c, dt, law, rows)
+    ease_off(c, springs.dt, law, rows)
     row = rows[c]
     if c == 0:
         springs.solves[0] = 0
@@ -306,27 +272,24 @@ def begin_springs(
     if row.nodes[0] >= 0:
         for k in range(4):
             if row.nodes[k] >= 0:
-                entries[k] = particle_entry[row.nodes[k]]
+                entries[k] = unknowns.particle[row.nodes[k]]
         point, arm = point_and_arm(row, bodies)
-        entry = int(-1)
-        slide = row.velocity
+        springs.body[c] = -1
+        springs.slide[c] = row.velocity
         if row.body >= 0:
-            entry = body_entry[row.body]
-            slide = wp.transform_vector(bodies.q[row.body], slide)
-            springs.lever[c] = -wp.skew(arm) * roots[row.body]
-        apart = sum_of(row, q) - point
+            springs.body[c] = unknowns.body[row.body]
+            springs.slide[c] = wp.transform_vector(bodies.q[row.body], row.velocity)
+            springs.lever[c] = -wp.skew(arm) * unknowns.roots[row.body]
+        apart = sum_of(row, particles.q) - point
         if not is_attachment(row):
             apart = wp.vec3(gap_of(row, apart), 0.0, 0.0)
         springs.weights[c] = row.weights
-        springs.body[c] = entry
         springs.arm[c] = arm
         springs.normal[c] = row.normal
         springs.gap[c] = apart
-        springs.slide[c] = slide
         springs.most[c] = 0.0
-        law4 = wp.vec4(row.stiffness, row.damping, row.slope, 0.0) * row.measure
-        law4[3] = row.friction
-        springs.law[c] = law4
+        whole = row.measure
+        springs.law[c] = wp.vec4(whole * row.stiffness, whole * row.damping, whole * row.slope, row.friction)
     springs.nodes[c] = entries
 
 
@@ -345,41 +308,29 @@ def difference(springs: RowSprings, c: int, d: wp.array[wp.vec4]):
     return e
 
 
-@wp.struct
-class RowState:
-    """A row's force on the particles, its derivative S [N/m], and a contact's push along its normal [N]."""
-
-    force: wp.vec3
-    stiffness: wp.mat33
-    push: float
-
-
 @wp.func
-def row_state(springs: RowSprings, c: int, e: wp.vec3, most: float, dt: float, adhesion: float):
-    """Row c at the difference e of its sides, with friction of at most ``most`` [N].
+def row_state(springs: RowSprings, c: int, e: wp.vec3, most: float):
+    """Row c at the difference e of its sides, with friction of at most ``most`` [N]. Its derivative is S.
 
     Dampers of contacts act on what is deeper than at the beginning, so that the force is monotonic and continuous.
     """
-    made = RowState()
+    made = SpringState()
     law = springs.law[c]
     n = springs.normal[c]
-    velocity = e / dt - springs.slide[c]
+    velocity = e / springs.dt - springs.slide[c]
     unit = wp.identity(3, dtype=wp.float32)
     if n == wp.vec3():
         made.force = -law[0] * (springs.gap[c] + e) - law[1] * velocity
-        made.stiffness = (law[0] + law[1] / dt) * unit
+        made.derivative = (law[0] + law[1] / springs.dt) * unit
         return made
     first = springs.gap[c][0]
     gap = first + wp.dot(n, e)
     whole = wp.outer(n, n)
-    if gap <= adhesion:
-        made.push = -law[0] * gap
-        rate = law[0]
-        deeper = wp.max(-gap, 0.0) - wp.max(-first, 0.0)
-        if deeper > 0.0:
-            made.push += law[1] / dt * deeper
-            rate += law[1] / dt
-        made.stiffness = rate * whole
+    if gap <= springs.adhesion:
+        deeper = wp.max(wp.max(-gap, 0.0) - wp.max(-first, 0.0), 0.0)
+        rate = wp.where(deeper > 0.0, law[1] / springs.dt, 0.0)
+        made.push = rate * deeper - law[0] * gap
+        made.derivative = (law[0] + rate) * whole
         made.force = made.push * n
     if most > 0.0 and law[2] > 0.0:
         sliding = across(velocity, n)
@@ -390,85 +341,74 @@ def row_state(springs: RowSprings, c: int, e: wp.vec3, most: float, dt: float, a
             slope = most / speed
             sideways -= (LOOSE / (speed * speed)) * wp.outer(sliding, sliding)
         made.force -= slope * sliding
-        made.stiffness += (slope / dt) * sideways
+        made.derivative += (slope / springs.dt) * sideways
     return made
 
 
 @wp.kernel(enable_backward=False)
-def update_springs(
-    # In
-    dt: float,
-    adhesion: float,
-    is_solved: int,
-    d: wp.array[wp.vec4],
-    # In and out
-    springs: RowSprings,
-):
+def update_springs(is_solved: int, d: wp.array[wp.vec4], springs: RowSprings):
     """Forces and stiffness after motions d. If these have just been solved for, the bounds of friction follow the
     pushes there."""
     c = wp.tid()
     if springs.nodes[c][0] < 0:
         return
     e = difference(springs, c, d)
-    push = wp.max(row_state(springs, c, e, 0.0, dt, adhesion).push, 0.0)
+    push = wp.max(row_state(springs, c, e, 0.0).push, 0.0)
     most = bound_of(springs.most[c], push, springs.law[c][3], is_solved != 0, springs.solves[0])
-    made = row_state(springs, c, e, most, dt, adhesion)
+    made = row_state(springs, c, e, most)
     springs.most[c] = most
     springs.force[c] = made.force
-    springs.stiffness[c] = made.stiffness
+    springs.stiffness[c] = made.derivative
 
 
 @wp.kernel(enable_backward=False)
 def add_row_slopes(
     # In
-    dt: float,
-    adhesion: float,
+    unknowns: Unknowns,
     springs: RowSprings,
-    count: int,
     d: wp.array[wp.vec4],
     change: wp.array[wp.vec4],
     search: wp.array2d[wp.float64],
     # Out
     slopes: wp.array[wp.float64],
 ):
-    """Add the power of rows along ``change`` at the tried share of it, world by world [count entries]."""
+    """Add the power of rows along ``change`` at the tried share of it, world by world."""
     c = wp.tid()
     node = springs.nodes[c][0]
     if node < 0:
         return
-    world = node / count
+    world = node / unknowns.count
     of_change = difference(springs, c, change)
-    e = difference(springs, c, d) + float(search[world, TRIED]) * of_change
-    made = row_state(springs, c, e, springs.most[c], dt, adhesion)
+    made = row_state(springs, c, difference(springs, c, d) + float(search[world, TRIED]) * of_change, springs.most[c])
     wp.atomic_add(slopes, world, wp.dot(wp.vec3d(made.force), wp.vec3d(of_change)))
 
 
+@wp.func
+def add_free(unknowns: Unknowns, entry: int, force: wp.vec3, y: wp.array[wp.vec4]):
+    if entry >= 0:  # noqa: SIM102 - the next value exists only then
+        if unknowns.mass[entry] > 0.0:
+            add_force(y, entry, force)
+
+
 @wp.kernel(enable_backward=False)
-def add_row_forces(springs: RowSprings, x: wp.array[wp.vec4], y: wp.array[wp.vec4]):
+def add_row_forces(unknowns: Unknowns, springs: RowSprings, x: wp.array[wp.vec4], y: wp.array[wp.vec4]):
     """y += S x at free entries; if x is empty, the rows' forces [N, N m]."""
     c = wp.tid()
     nodes = springs.nodes[c]
     if nodes[0] < 0:
         return
-    force = wp.vec3()
+    force = springs.force[c]
     if x.shape[0] > 0:
         s = springs.stiffness[c]
         if wp.trace(s) == 0.0:
             return
         force = s * difference(springs, c, x)
-    else:
-        force = springs.force[c]
-    weights = springs.weights[c]
     for k in range(4):
-        if nodes[k] >= 0:  # noqa: SIM102 - the next value exists only then
-            if springs.mass[nodes[k]] > 0.0:
-                add_force(y, nodes[k], weights[k] * force)
+        add_free(unknowns, nodes[k], springs.weights[c][k] * force, y)
     body = springs.body[c]
     if body >= 0:
-        if springs.mass[body] > 0.0:
-            add_force(y, body, -force)
-        if springs.mass[body + 1] > 0.0:
-            add_force(y, body + 1, -(wp.transpose(springs.lever[c]) * force))
+        add_free(unknowns, body, -force, y)
+        add_free(unknowns, body + 1, -(wp.transpose(springs.lever[c]) * force), y)
 
 
 @wp.kernel(enable_backward=False)
@@ -494,8 +434,8 @@ def add_row_blocks(springs: RowSprings, blocks: wp.array[wp.mat33]):
 def report_rows(
     # In
     springs: RowSprings,
+    unknowns: Unknowns,
     contacts: int,
-    entry_body: wp.array[wp.int32],
     share: float,
     first: int,
     # Out
@@ -509,6 +449,6 @@ def report_rows(
     force = springs.force[c]
     wrench = -wp.spatial_vector(force, wp.cross(springs.arm[c], force))
     if springs.body[c] >= 0:
-        wp.atomic_add(body_f, entry_body[springs.body[c]], wrench)
+        wp.atomic_add(body_f, unknowns.owner[springs.body[c]], wrench)
     if c < contacts and reported.shape[0] > 0:
         reported[first + c] += share * wrench

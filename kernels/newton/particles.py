@@ -6,11 +6,11 @@ restored. If the input was not finite, the world is not written at all. Entities
 arrays over worlds.
 """
 
-import functools
+from typing import Any
 
 import warp as wp
 
-from warp_corot.kernels.elements.elements import add_force, load_node, store_node
+from warp_corot.kernels.elements.elements import load_node, store_node
 from warp_corot.kernels.stepping.integrate import is_finite
 
 wp.set_module_options({"enable_backward": False})
@@ -31,17 +31,21 @@ RUNAWAY = wp.constant(1.0e5)
 
 @wp.struct
 class Particles:
-    """Particles of a model, with Newton's names."""
+    """Particles of a model in a state, with Newton's names."""
 
     flags: wp.array[wp.int32]
     world: wp.array[wp.int32]
     inv_mass: wp.array[wp.float32]
+    radius: wp.array[wp.float32]
     gravity: wp.array[wp.vec3]  # of each world
+    q: wp.array[wp.vec3]
+    qd: wp.array[wp.vec3]
+    trouble: wp.array[wp.int32]  # the failure of each world in this step
 
 
 @wp.struct
 class Bodies:
-    """Rigid bodies of a model, with Newton's names, and their state."""
+    """Rigid bodies of a model in a state, with Newton's names."""
 
     fixed_flag: int  # of bodies with prescribed motion
     flags: wp.array[wp.int32]
@@ -50,9 +54,20 @@ class Bodies:
     inv_inertia: wp.array[wp.mat33]
     inertia: wp.array[wp.mat33]
     com: wp.array[wp.vec3]
+    gravity: wp.array[wp.vec3]
     places: wp.array[wp.float32]  # at how many places each may be touched or is held
     q: wp.array[wp.transform]
     qd: wp.array[wp.spatial_vector]
+    trouble: wp.array[wp.int32]
+
+
+@wp.struct
+class Memory:
+    """What particles had in the last step and have in this one, see ``UNKNOWN_BEFORE``; empty without contacts."""
+
+    eased: float  # how far contacts that were found late have been let out in the last step [m]
+    before: wp.array[wp.float32]
+    after: wp.array[wp.float32]
 
 
 @wp.func
@@ -73,20 +88,15 @@ def is_moved(i: int, particles: Particles):
 
 
 @wp.func
-def gravity_of(i: int, particles: Particles):
-    return particles.gravity[place_of(particles.world[i], particles.gravity.shape[0])]
+def in_world(owner: Any, i: int, values: wp.array[Any]):
+    """The value of the world of particle or body i."""
+    return values[place_of(owner.world[i], values.shape[0])]
 
 
 @wp.func
-def trouble_of(i: int, particles: Particles, trouble: wp.array[wp.int32]):
-    """The failure of a particle's world."""
-    return trouble[place_of(particles.world[i], trouble.shape[0])]
-
-
-@wp.func
-def mark(i: int, wrong: int, particles: Particles, trouble: wp.array[wp.int32]):
-    """Mark the world of a particle."""
-    wp.atomic_max(trouble, place_of(particles.world[i], trouble.shape[0]), wrong)
+def mark(i: int, wrong: int, owner: Any):
+    """Mark the world of particle or body i."""
+    wp.atomic_max(owner.trouble, place_of(owner.world[i], owner.trouble.shape[0]), wrong)
 
 
 @wp.func_native("""
@@ -118,34 +128,28 @@ def store_vector(a: wp.array[wp.vec3], i: int, value: wp.vec3):
 @wp.kernel(enable_backward=False)
 def gather_particles(
     # In
-    q: wp.array[wp.vec3],
-    qd: wp.array[wp.vec3],
-    external: wp.array[wp.vec3],
     particles: Particles,
+    external: wp.array[wp.vec3],
     rest: wp.array[wp.vec4],
     wrong: int,
     # In and out
-    before: wp.array[wp.float32],
-    after: wp.array[wp.float32],
+    memory: Memory,
     # Out
     u: wp.array[wp.vec4],
     f: wp.array[wp.vec4],
     kept_q: wp.array[wp.vec3],
     kept_qd: wp.array[wp.vec3],
-    trouble: wp.array[wp.int32],
 ):
     """Gather displacements from ``rest``, or positions if it is empty, and copies into the arrays that are not empty;
-    forces start with the external ones [N]. A value that is not finite marks its world.
-
-    Args:
-        before, after: What particles had in the last step, which is replaced, and have in this one; see ``records``.
+    forces start with the external ones [N]. A value that is not finite marks its world as ``wrong``. What particles
+    have in this step becomes what they had before.
     """
     i = wp.tid()
-    if after.shape[0] > 0:
-        before[i] = after[i]
-        after[i] = NO_ROW
-    at = q[i]
-    velocity = qd[i]
+    if memory.after.shape[0] > 0:
+        memory.before[i] = memory.after[i]
+        memory.after[i] = NO_ROW
+    at = particles.q[i]
+    velocity = particles.qd[i]
     force = external[i]
     store_node(f, i, force)
     from_rest = at
@@ -156,7 +160,7 @@ def gather_particles(
         store_vector(kept_q, i, at)
         store_vector(kept_qd, i, velocity)
     if not (is_finite(at) and is_finite(velocity) and is_finite(force)):
-        mark(i, wrong, particles, trouble)
+        mark(i, wrong, particles)
 
 
 @wp.kernel(enable_backward=False)
@@ -168,14 +172,11 @@ def step_particles(
     fastest: float,
     particles: Particles,
     f: wp.array[wp.vec4],
-    q: wp.array[wp.vec3],
-    qd: wp.array[wp.vec3],
     entry: wp.array[wp.int32],
     d: wp.array[wp.vec4],
     # Out
-    q_out: wp.array[wp.vec3],
-    qd_out: wp.array[wp.vec3],
-    trouble: wp.array[wp.int32],
+    q: wp.array[wp.vec3],
+    qd: wp.array[wp.vec3],
 ):
     """v <- (v + dt (f/m + g)) / (1 + dt damping), or d/dt of solved motions d; x <- x + dt v.
 
@@ -187,17 +188,18 @@ def step_particles(
         entry, d: Where the motion of each particle is, and motions [m], see ``implicit``; empty in explicit steps.
     """
     i = wp.tid()
-    wrong = trouble_of(i, particles, trouble)
+    wrong = in_world(particles, i, particles.trouble)
     if wrong == BAD_INPUT:
         return
-    at = q[i]
-    velocity = qd[i]
+    at = particles.q[i]
+    velocity = particles.qd[i]
     if wrong == SOUND and is_active(i, particles):
         w = particles.inv_mass[i]
         if w > 0.0 and d.shape[0] > 0:
             velocity = load_node(d, entry[i]) / dt
         elif w > 0.0:
-            velocity = (velocity + dt * (w * load_node(f, i) + gravity_of(i, particles))) / (1.0 + dt * damping)
+            g = in_world(particles, i, particles.gravity)
+            velocity = (velocity + dt * (w * load_node(f, i) + g)) / (1.0 + dt * damping)
         # Scaled, so that nothing overflows.
         size = wp.max(wp.max(wp.abs(velocity)), 1.0)
         speed = size * wp.length(velocity / size)
@@ -205,44 +207,18 @@ def step_particles(
             velocity = velocity * (most / speed)
         at += dt * velocity
         if speed >= fastest or not is_finite(at):
-            mark(i, UNSTABLE, particles, trouble)
-    store_vector(q_out, i, at)
-    store_vector(qd_out, i, velocity)
+            mark(i, UNSTABLE, particles)
+    store_vector(q, i, at)
+    store_vector(qd, i, velocity)
 
 
 @wp.kernel(enable_backward=False)
-def add_changes(
-    # In
-    dt: float,
-    particles: Particles,
-    before: wp.array[wp.vec3],
-    after: wp.array[wp.vec3],
-    # In and out
-    f: wp.array[wp.vec4],
-):
+def add_changes(dt: float, particles: Particles, after: wp.array[wp.vec3], f: wp.array[wp.vec4]):
     """Add the forces besides gravity that changed velocities in a step."""
     i = wp.tid()
     if is_moved(i, particles):
-        change = (after[i] - before[i]) / dt - gravity_of(i, particles)
+        change = (after[i] - particles.qd[i]) / dt - in_world(particles, i, particles.gravity)
         store_node(f, i, load_node(f, i) + change / particles.inv_mass[i])
-
-
-@wp.kernel(enable_backward=False)
-def scatter_blocks(
-    # In
-    pairs: wp.array[wp.vec2i],
-    stiffness: wp.array[wp.mat33],
-    damping: wp.array[wp.mat33],
-    a: float,
-    b: float,
-    u: wp.array[wp.vec4],
-    # Out
-    f: wp.array[wp.vec4],
-):
-    """f -= (a K + b C) u of matrices that are given by blocks of pairs of particles, which may repeat."""
-    k = wp.tid()
-    pair = pairs[k]
-    add_force(f, pair[0], -(a * stiffness[k] + b * damping[k]) * load_node(u, pair[1]))
 
 
 # --- rigid bodies within a step, between the states that another solver gives ----------------------------------------
@@ -269,13 +245,8 @@ def move_bodies(elapsed: float, bodies: Bodies, moved: wp.array[wp.transform]):
 
 
 @wp.kernel(enable_backward=False)
-def add_wrenches(
-    # In
-    share: float,
-    a: wp.array[wp.spatial_vector],
-    # In and out
-    b: wp.array[wp.spatial_vector],
-):
+def add_wrenches(share: float, a: wp.array[wp.spatial_vector], b: wp.array[wp.spatial_vector]):
+    """b += share a."""
     i = wp.tid()
     b[i] = b[i] + share * a[i]
 
@@ -284,29 +255,20 @@ def add_wrenches(
 
 
 @wp.kernel(enable_backward=False)
-def check_bodies(
-    # In
-    q: wp.array[wp.transform],
-    qd: wp.array[wp.spatial_vector],
-    world: wp.array[wp.int32],
-    wrong: int,
-    # Out
-    trouble: wp.array[wp.int32],
-):
+def check_bodies(bodies: Bodies, wrong: int):
     """Mark worlds with a body whose pose or velocity is not finite."""
     i = wp.tid()
-    size = wp.dot(wp.abs(q[i][0:3]), wp.vec3(1.0)) + wp.dot(wp.abs(wp.spatial_top(qd[i])), wp.vec3(1.0))
-    size += wp.dot(wp.abs(wp.spatial_bottom(qd[i])), wp.vec3(1.0))
-    if not size <= 3.0e38:
-        wp.atomic_max(trouble, place_of(world[i], trouble.shape[0]), wrong)
+    twist = bodies.qd[i]
+    sum = wp.abs(bodies.q[i][0:3]) + wp.abs(wp.spatial_top(twist)) + wp.abs(wp.spatial_bottom(twist))
+    if not wp.dot(sum, wp.vec3(1.0)) <= 3.0e38:
+        mark(i, wrong, bodies)
 
 
-@functools.cache
 def state_kernels(Place: type, Velocity: type) -> tuple[wp.Kernel, wp.Kernel]:
-    """The kernels that finish a step and that reset a state, for states with these types: of particles vec3 both, of
-    bodies transforms and spatial vectors.
+    """The kernels that finish a step and that reset a state, for states with these types.
 
-    They are one module, so that those of resets are loaded with those of steps and may be recorded.
+    They are one module, so that those of resets are loaded with those of steps and may be recorded. They are not
+    instances of one generic kernel, which recordings on the CPU mistake for one another.
     """
     module = wp.get_module(f"newton_states_{Place.__name__}")
     module.options["enable_backward"] = False
@@ -342,34 +304,31 @@ def state_kernels(Place: type, Velocity: type) -> tuple[wp.Kernel, wp.Kernel]:
     @wp.kernel(module=module, enable_backward=False)
     def reset(
         # In
-        chosen: wp.array[wp.bool],
         world: wp.array[wp.int32],
-        with_q: int,
-        with_qd: int,
+        chosen: wp.array[wp.bool],
         initial_q: wp.array[Place],
         initial_qd: wp.array[Velocity],
         # Out
         q: wp.array[Place],
         qd: wp.array[Velocity],
     ):
+        """Reset what is in chosen worlds; arrays that are empty are left out."""
         i = wp.tid()
         if chosen[place_of(world[i], chosen.shape[0])]:
-            if with_q != 0:
+            if q.shape[0] > 0:
                 q[i] = initial_q[i]
-            if with_qd != 0:
+            if qd.shape[0] > 0:
                 qd[i] = initial_qd[i]
 
     return finish, reset
 
 
+FINISH_PARTICLES, RESET_PARTICLES = state_kernels(wp.vec3, wp.vec3)
+FINISH_BODIES, RESET_BODIES = state_kernels(wp.transform, wp.spatial_vector)
+
+
 @wp.kernel(enable_backward=False)
-def report_trouble(
-    # In and out
-    trouble: wp.array[wp.int32],
-    # Out
-    report: wp.array[wp.int32],
-    seen: wp.array[wp.float64],
-):
+def report_trouble(trouble: wp.array[wp.int32], report: wp.array[wp.int32], seen: wp.array[wp.float64]):
     """Record the failure and its world, and clear failures for the next step.
 
     Args:

@@ -27,7 +27,16 @@ import warp as wp
 
 from warp_corot.kernels.elements.elements import add_force, load_node
 
-from .particles import ACTIVE, NO_ROW, TOO_MANY_CONTACTS, Bodies, Particles, gravity_of, is_moved
+from .particles import (
+    ACTIVE,
+    NO_ROW,
+    TOO_MANY_CONTACTS,
+    Bodies,
+    Memory,
+    Particles,
+    in_world,
+    is_moved,
+)
 
 wp.set_module_options({"enable_backward": False})
 
@@ -142,7 +151,7 @@ def pull_of(row: Row, dt: float, particles: Particles, before: wp.array[wp.vec4]
         if i >= 0:  # noqa: SIM102 - the next values exist only then
             if is_moved(i, particles):
                 push = particles.inv_mass[i] * load_node(before, i)
-                pull += row.weights[k] * dt * (push + gravity_of(i, particles))
+                pull += row.weights[k] * dt * (push + in_world(particles, i, particles.gravity))
     return pull
 
 
@@ -233,22 +242,14 @@ def place_of_record(c: int, records: Records):
 @wp.func
 def has_active(row: Row, flags: wp.array[wp.int32]):
     """Whether a particle of the row is active."""
-    active = bool(False)
+    found = int(0)
     for k in range(4):
-        if row.nodes[k] >= 0:  # noqa: SIM102 - the next value exists only then
-            if (flags[row.nodes[k]] & ACTIVE) != 0:
-                active = True
-    return active
+        if row.nodes[k] >= 0:
+            found = found | flags[row.nodes[k]]
+    return (found & ACTIVE) != 0
 
 
 # --- records of meshes -----------------------------------------------------------------------------------------------
-
-
-@wp.func
-def in_frame_of_body(x: wp.vec3, body: int, body_q: wp.array[wp.transform]):
-    if body >= 0:
-        return wp.transform_point(wp.transform_inverse(body_q[body]), x)
-    return x
 
 
 @wp.func
@@ -301,15 +302,17 @@ def counts(c: int, x: wp.vec3, records: Records, shapes: Shapes):
     return away <= DEEPER * GRAIN * float(records.nearest[rival] / NUMBERS) + TINY
 
 
+@wp.func
+def soft_point(row: Row, body: int, q: wp.array[wp.vec3], bodies: Bodies):
+    """The soft point of a record, in the frame of its shape's body."""
+    x = sum_of(row, q)
+    if body >= 0:
+        x = wp.transform_point(wp.transform_inverse(bodies.q[body]), x)
+    return x
+
+
 @wp.kernel(enable_backward=False)
-def find_nearest(
-    # In
-    shapes: Shapes,
-    q: wp.array[wp.vec3],
-    body_q: wp.array[wp.transform],
-    # In and out
-    records: Records,
-):
+def find_nearest(shapes: Shapes, q: wp.array[wp.vec3], bodies: Bodies, records: Records):
     """Find the nearest soft triangle of each vertex of a mesh, and how far the nearest edge of each soft edge is."""
     c = wp.tid()
     if c >= wp.min(records.count[0], records.features.shape[0]):
@@ -317,11 +320,24 @@ def find_nearest(
     feature = records.features[c]
     rival = rival_of(feature, records.vertices)
     if rival >= 0:
-        x = in_frame_of_body(sum_of(place_of_record(c, records), q), shapes.body[records.shape[c]], body_q)
+        x = soft_point(place_of_record(c, records), shapes.body[records.shape[c]], q, bodies)
         wp.atomic_min(records.nearest, rival, code_of(wp.length(x - records.body_pos[c]), feature[1]))
 
 
 # --- rows ------------------------------------------------------------------------------------------------------------
+
+
+@wp.func
+def attachment_row(a: int, attachments: Attachments):
+    row = no_row()
+    row.nodes[0] = attachments.particle[a]
+    row.weights = wp.vec4(1.0, 0.0, 0.0, 0.0)
+    row.measure = 1.0
+    row.body = attachments.body[a]
+    row.point = attachments.body_point[a]
+    row.stiffness = attachments.stiffness[a]
+    row.damping = attachments.damping[a]
+    return row
 
 
 @wp.kernel(enable_backward=False)
@@ -332,66 +348,51 @@ def fill_rows(
     records: Records,
     shapes: Shapes,
     attachments: Attachments,
-    flags: wp.array[wp.int32],
-    radius: wp.array[wp.float32],
-    q: wp.array[wp.vec3],
-    body_q: wp.array[wp.transform],
-    eased: float,
-    before: wp.array[wp.float32],
-    # Out
-    after: wp.array[wp.float32],
+    particles: Particles,
+    bodies: Bodies,
+    # In and out
+    memory: Memory,
     load: wp.array[wp.float32],
-    places: wp.array[wp.float32],
+    # Out
     rows: wp.array[Row],
-    trouble: wp.array[wp.int32],
 ):
     """Rows of so many records, and then of attachments. If there are more contacts than records, the worlds of the
     missing ones are unknown, so none is stepped.
 
     Args:
-        eased: How far contacts that were found late have been let out in the last step [m].
-        before, after: What particles had in the last step and have in this one; see ``worlds.NO_ROW``.
-        load, places: In how many rows particles and bodies are, zero before.
+        load: In how many rows particles are, as ``bodies.places``, zero before.
     """
     c = wp.tid()
     row = no_row()
     if c >= contacts:
-        a = c - contacts
-        if attachments.enabled[a]:
-            row.nodes[0] = attachments.particle[a]
-            row.weights = wp.vec4(1.0, 0.0, 0.0, 0.0)
-            row.measure = 1.0
-            row.body = attachments.body[a]
-            row.point = attachments.body_point[a]
-            row.stiffness = attachments.stiffness[a]
-            row.damping = attachments.damping[a]
-            wp.atomic_add(load, row.nodes[0], 1.0)
-            wp.atomic_add(places, row.body, 1.0)
+        if attachments.enabled[c - contacts]:
+            row = attachment_row(c - contacts, attachments)
+            add_load(row, 1.0, load)
+            wp.atomic_add(bodies.places, row.body, 1.0)
         rows[c] = row
         return
     if c == 0 and records.count[0] > contacts:
-        for w in range(trouble.shape[0]):
-            wp.atomic_max(trouble, w, TOO_MANY_CONTACTS)
+        for w in range(particles.trouble.shape[0]):
+            wp.atomic_max(particles.trouble, w, TOO_MANY_CONTACTS)
     if c < records.count[0]:
         found = place_of_record(c, records)
         shape = records.shape[c]
         body = shapes.body[shape]
-        is_one = found.measure > 0.0 and has_active(found, flags)
+        is_one = found.measure > 0.0 and has_active(found, particles.flags)
         if is_one and records.features.shape[0] > 0:
-            is_one = counts(c, in_frame_of_body(sum_of(found, q), body, body_q), records, shapes)
+            is_one = counts(c, soft_point(found, body, particles.q, bodies), records, shapes)
         if is_one:
             row = found
             row.body = body
             add_load(row, 1.0, load)
             if body >= 0:
-                wp.atomic_add(places, body, row.measure)
+                wp.atomic_add(bodies.places, body, row.measure)
             row.point = records.body_pos[c]
             row.velocity = records.body_vel[c]
             row.normal = records.normal[c]
-            row.offset = radius[row.nodes[0]]
-            for k in range(1, 3):
+            for k in range(3):
                 if row.nodes[k] >= 0:
-                    row.offset = wp.max(row.offset, radius[row.nodes[k]])
+                    row.offset = wp.max(row.offset, particles.radius[row.nodes[k]])
             if shapes.margin.shape[0] > 0:
                 row.offset += shapes.margin[shape]
             row.stiffness = 0.5 * (law.stiffness + shapes.material_ke[shape])
@@ -400,15 +401,13 @@ def fill_rows(
             row.friction = 0.5 * (law.friction + shapes.material_mu[shape])
             i = records.particle[c]
             if i >= 0:
-                place = row.point
-                if body >= 0:
-                    place = wp.transform_point(body_q[body], place)
-                depth = -gap_of(row, q[i] - place)
-                if before[i] == NO_ROW:
-                    row.ease = wp.max(depth, 0.0)
-                elif before[i] > 0.0:
-                    row.ease = wp.clamp(before[i] - eased, 0.0, wp.max(depth, 0.0))
-                wp.atomic_max(after, i, row.ease)
+                point, _arm = point_and_arm(row, bodies)
+                depth = wp.max(-gap_of(row, particles.q[i] - point), 0.0)
+                if memory.before[i] == NO_ROW:
+                    row.ease = depth
+                elif memory.before[i] > 0.0:
+                    row.ease = wp.clamp(memory.before[i] - memory.eased, 0.0, depth)
+                wp.atomic_max(memory.after, i, row.ease)
     rows[c] = row
 
 

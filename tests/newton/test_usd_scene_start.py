@@ -7,14 +7,14 @@ from scene_stages import CELL, SIM, StageMaker, StageOptions, StageSimulation, s
 
 from warp_corot.cli import main
 from warp_corot.io.read.usd.scene import open_scene
-from warp_corot.newton.stages.stage import stage_model
+from warp_corot.newton.stages.stage import StageModel
 
 VOLUME = 12 * CELL**3
 
 
 def parts(path, **options):
     """The model of a stage, without a solver."""
-    return stage_model(open_scene(path), StageOptions(**options), "cpu")
+    return StageModel(open_scene(path), StageOptions(**options), "cpu")
 
 
 def notes(path, **options) -> str:

@@ -12,11 +12,10 @@ from warp_corot.discretization.sizes import padded
 from warp_corot.elasticity import ForceField
 from warp_corot.errors import ConvergenceError
 from warp_corot.solvers.implicit.conjugate_gradients import ConjugateGradients
-from warp_corot.solvers.implicit.operator import LinearOperator
 from warp_corot.solvers.implicit.preconditioners import preconditioner_of
 from warp_corot.solvers.implicit.tangent import TangentOperator
 
-from .contact import RestingContact, RestingOperator, RestingPreconditioner
+from .contact import RestingContact
 
 if TYPE_CHECKING:
     from warp_corot.body.soft_body import SoftBody
@@ -40,6 +39,7 @@ class Adjoint:
         contact: The contacts that the motion keeps to, if there are any.
 
     Attributes:
+        contact: The same, which may be changed.
         iterations: Number of iterations of conjugate gradients in the world that needed most.
         residual: Norm of g - (K + s M) a over that of g, the largest of all worlds.
         multipliers: With contact, the shares of the contacts' normals in g - (K + s M) a, float64 [contacts].
@@ -54,23 +54,33 @@ class Adjoint:
         contact: RestingContact | None = None,
     ):
         self.body, self.operator, self._tolerance = body, TangentOperator(body, field, exact=True), tolerance
-        self._free_preconditioner = preconditioner_of(preconditioner, self.operator)
-        self._solver = ConjugateGradients(self.operator, len(body.state.displacements), most=MOST)
-        self.keep_to(contact)
+        self.device, self.worlds, self.node_count = body.device, body.worlds, self.operator.node_count
+        self._preconditioner = preconditioner_of(preconditioner, self.operator)
+        self._solver = ConjugateGradients(self, len(body.state.displacements), most=MOST)
+        self.contact, self._r = contact, wp.zeros_like(body.state.displacements)
         self.multipliers = np.zeros(0)
         self._solver.tolerance.fill_(tolerance)
         self._held = body.conditions.held_mask()[:, None]
         self._masses, self._share = body.masses[:, None], 0.0
         self.iterations, self.residual = 0, 0.0
 
-    def keep_to(self, contact: RestingContact | None) -> None:
-        """Let the motion keep to other contacts, or to none."""
-        operator: LinearOperator = self.operator
-        self._contact, self._preconditioner = contact, self._free_preconditioner
-        if contact is not None:
-            operator = RestingOperator(operator, contact)  # type: ignore[assignment]
-            self._preconditioner = RestingPreconditioner(self._preconditioner, contact)
-        self._solver.operator = operator
+    def apply(self, x: wp.array, y: wp.array) -> None:
+        """Launch y = A x, or S (A + G) x with contact, for x in the range of the projector S that keeps to it."""
+        self.operator.apply(x, y)
+        if self.contact is not None:
+            self.contact.launch_turning(x, y)
+            self.contact.launch_free(y)
+
+    def _precondition(self, r: wp.array, z: wp.array) -> None:
+        """Launch z = B r, or S B S r with contact."""
+        if self.contact is None:
+            self._preconditioner.apply(r, z)
+            return
+        # Rounding moves residuals out of the range of S.
+        wp.copy(self._r, r)
+        self.contact.launch_free(self._r)
+        self._preconditioner.apply(self._r, z)
+        self.contact.launch_free(z)
 
     def take(self, u: wp.array, share: float = 0.0) -> None:
         """Set the stiffness to that at displacements u [m], vec4 [worlds * N], with the factor s of the mass
@@ -100,10 +110,10 @@ class Adjoint:
         adjoint = (found.reshape(body.worlds, -1) * scale[:, None]).reshape(-1, 3)
         motion = wp.array(padded(adjoint), dtype=wp.vec4, device=body.device)
         product = self._product(motion)
-        if self._contact is not None:
+        if self.contact is not None:
             rest = right - product - self._share * self._masses * adjoint
-            self.multipliers = self._contact.multipliers(np.where(self._held, 0.0, rest))
-            product = product + self._contact.reactions(self.multipliers)
+            self.multipliers = self.contact.multipliers(np.where(self._held, 0.0, rest))
+            product = product + self.contact.reactions(self.multipliers)
         return motion, product
 
     def _refined(self, right: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
@@ -114,10 +124,11 @@ class Adjoint:
         wanted = np.linalg.norm(right.reshape(worlds, -1), axis=1)
         best = np.inf
         for number in range(REFINEMENTS):
-            self._solver.launch(self._preconditioner, wp.array(padded(left), dtype=wp.vec4, device=device), x)
+            self._solver.begin(wp.array(padded(left), dtype=wp.vec4, device=device), x)
+            self._solver.iterate(self._precondition, x)
             report = self._solver.report()
             # Near the answer, what rounding leaves along contacts' normals may be all of the residual.
-            rounded = (report.residual < ENOUGH) & (self._contact is not None)
+            rounded = (report.residual < ENOUGH) & (self.contact is not None)
             if number == 0 and ((report.negative | report.broken) & ~rounded).any():
                 raise ConvergenceError(
                     "the stiffness is not positive definite: the state is not stable, and has no gradient"
@@ -141,11 +152,11 @@ class Adjoint:
 
     def _free(self, x: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
         """x without what contacts do not let nodes follow."""
-        return x if self._contact is None else self._contact.free(x)
+        return x if self.contact is None else self.contact.free(x)
 
     def _product(self, x: wp.array) -> npt.NDArray[np.float64]:
         """K x at all nodes, held ones too, and the turning of contacts' normals."""
         y = wp.zeros_like(x)
         self.operator.tangent.add_product(x, y)
         product = y.numpy()[:, :3].astype(np.float64)
-        return product if self._contact is None else product + self._contact.turning(x.numpy()[:, :3].astype(float))
+        return product if self.contact is None else product + self.contact.turning(x.numpy()[:, :3].astype(float))

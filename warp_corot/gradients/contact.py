@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -13,12 +14,13 @@ import warp as wp
 from warp_corot.contact.contacts import Contacts
 from warp_corot.contact.obstacles import measured_gaps
 from warp_corot.contact.reading import ActingRow, acting_rows
+from warp_corot.contact.shapes import Ground, Shape, Sphere, axis_of
 from warp_corot.errors import InputError
-from warp_corot.kernels.gradients import contact as kernels
-from warp_corot.solvers.implicit.operator import LinearOperator, Preconditioner
+from warp_corot.kernels.gradients import steps as kernels
+from warp_corot.kernels.implicit.tangent import add_products
 
 if TYPE_CHECKING:
-    from scipy.sparse import csr_array
+    from scipy.sparse import csc_array, csr_array
 
     from warp_corot.body.soft_body import SoftBody
 
@@ -93,10 +95,6 @@ class RestingContact:
             return
         self.obstacle = np.array([column.row.obstacle for column in self.columns])
         self._assemble()
-        free = np.repeat(~body.conditions.held_mask(), 3)
-        self._free_normals = self._all_normals.multiply(free[:, None]).tocsc()
-        self._inverse = _inverse((self._free_normals.T @ self._free_normals).toarray())
-        self._upload()
 
     @property
     def pushes(self) -> bool:
@@ -104,28 +102,27 @@ class RestingContact:
         return bool(self.columns)
 
     def _assemble(self) -> None:
-        """The sparse matrices: ``_all_normals`` N [3n, m], ``_turning`` G [3n, 3n], and the sums of G's columns over
-        the nodes of each contact, ``_moved`` [m, 3n, 3] as a list."""
-        from scipy.sparse import coo_array
-
-        count, m = 3 * self._body.sizes.nodes, len(self.columns)
+        """Find N, G, the inverse of N^T N at free nodes, and ``_moved``: the nodes of each contact, and the sums of G's
+        columns over them, [nodes, 3, 3]."""
+        count = self._body.sizes.nodes
         x = self._contacts.surface.arrays.x.numpy().astype(float)
-        entries, blocks, self._moved = [], [], []
-        for i, (column, curvature) in enumerate(zip(self.columns, self._curvatures(), strict=True)):
+        parts, blocks = [], []
+        for column, curvature in zip(self.columns, self._curvatures(), strict=True):
             row, normal = column.row, column.normal
-            lines = (3 * column.nodes[:, None] + np.arange(3)).ravel()
-            entries.append((lines, np.full(len(lines), i), (column.weights.T @ row.weights)[:, None] * normal))
+            parts.append((column.nodes, (column.weights.T @ row.weights)[:, None] * normal))
             push = float(row.force @ normal) if column.yields else 0.0
             at = x[row.places]
             bends = pair_hessian(row, at) if row.obstacle < 0 else self._hessian(row, at, normal, curvature)
             spread = np.kron(column.weights, np.eye(3))
-            block = spread.T @ (-push * bends) @ spread
-            blocks.append((np.repeat(lines, len(lines)), np.tile(lines, len(lines)), block))
-            self._moved.append((lines, block.reshape(len(lines), -1, 3).sum(axis=1)))
-        lines, which, values = (np.concatenate([np.ravel(e[k]) for e in entries]) for k in range(3))
-        self._all_normals = coo_array((values, (lines, which)), shape=(count, m)).tocsc()
-        first, second, values = (np.concatenate([np.ravel(b[k]) for b in blocks]) for k in range(3))
-        self._turning: csr_array = coo_array((values, (first, second)), shape=(count, count)).tocsr()
+            blocks.append((column.nodes, by_nodes(spread.T @ (-push * bends) @ spread)))
+        self._moved = [(nodes, block.sum(axis=1)) for nodes, block in blocks]
+        self._all_normals, self._turning = normals_of(parts, count), turning_of(blocks, count)
+        free = ~self._body.conditions.held_mask()
+        self._free_normals = self._all_normals.multiply(np.repeat(free, 3)[:, None]).tocsc()
+        # Contacts that others contain share their forces with these.
+        square = (self._free_normals.T @ self._free_normals).toarray()
+        self._inverse = np.linalg.pinv(square, rcond=DEPENDENT, hermitian=True)
+        self._upload(free, joined_parts(parts), joined_blocks(blocks))
 
     def _borne(self, row: ActingRow) -> tuple[Ints, Array]:
         """The nodes that bear a contact's places, numbered over all worlds, and their weights [places, nodes]."""
@@ -176,48 +173,33 @@ class RestingContact:
         found[np.ix_(used, axes, used, axes)] = inner
         return found.reshape(3 * count, 3 * count)
 
-    def _upload(self) -> None:
-        """The same for kernels."""
-        device, rows = self._body.device, kernels.Rows()
-        by_row = self._by_nodes(self._free_normals)
-        rows.starts, rows.nodes = _starts(by_row[0], len(self.obstacle), device), _ints(by_row[1], device)
-        rows.parts = wp.array(by_row[2], dtype=wp.vec3, device=device)
-        touched = np.unique(by_row[1])
-        order = np.argsort(by_row[1], kind="stable")
-        rows.touched, rows.of_node, rows.row = (_ints(each, device) for each in (touched, order, by_row[0]))
-        rows.node_starts = _starts(np.searchsorted(touched, by_row[1][order]), len(touched), device)
-        rows.inverse = wp.array(self._inverse, dtype=wp.float64, device=device)
-        blocks = self._turning.tobsr((3, 3))
-        starts = np.concatenate([[0], np.cumsum(np.diff(blocks.indptr)[touched])])
-        picked = np.concatenate([np.arange(blocks.indptr[n], blocks.indptr[n + 1]) for n in touched]).astype(int)
-        rows.block_starts, rows.block_nodes = _ints(starts, device), _ints(blocks.indices[picked], device)
-        rows.blocks = wp.array(blocks.data[picked], dtype=wp.mat33, device=device)
-        self._rows = rows
-        self._along, self._shared = (wp.zeros(len(self.obstacle), dtype=wp.float64, device=device) for _ in range(2))
-
-    @staticmethod
-    def _by_nodes(normals: csr_array) -> tuple[Ints, Ints, Array]:
-        """The contact, the node and the part of each entry of N, contact by contact."""
-        entries = normals.tocoo()
-        count = normals.shape[0] // 3
-        keys, which = np.unique(entries.col.astype(np.int64) * count + entries.row // 3, return_inverse=True)
-        parts = np.zeros((len(keys), 3))
-        parts[which.ravel(), entries.row % 3] = entries.data
-        return keys // count, keys % count, parts
+    def _upload(
+        self, free: npt.NDArray[np.bool_], parts: tuple[Ints, Ints, Array], blocks: tuple[Ints, Ints, Array]
+    ) -> None:
+        """Give kernels N and G at free nodes."""
+        device, self._rows = self._body.device, kernels.Rows()
+        self._launch = partial(wp.launch, device=device)
+        couples = free[blocks[0]] & free[blocks[1]] & blocks[2].any(axis=(1, 2))
+        which, nodes, values = (a[free[parts[1]]] for a in parts)
+        self._rows.row, self._rows.node = (wp.array(a, dtype=wp.int32, device=device) for a in (which, nodes))
+        self._rows.part = wp.array(values, dtype=wp.vec3, device=device)
+        self._rows.inverse = wp.array(self._inverse, dtype=wp.float64, device=device)
+        kinds = (wp.int32, wp.int32, wp.mat33)
+        self._couplings = [wp.array(a[couples], dtype=k, device=device) for a, k in zip(blocks, kinds, strict=True)]
+        self._along, self._shared = (wp.zeros(len(self.columns), dtype=wp.float64, device=device) for _ in range(2))
 
     # --- on the device -----------------------------------------------------------------------------------------------
 
     def launch_free(self, x: wp.array) -> None:
         """Launch the removal of what moves nodes off obstacles or into them."""
-        device, rows = self._body.device, self._rows
-        count = len(self.obstacle)
-        wp.launch(kernels.measure_rows, count, [rows, x, self._along], device=device)
-        wp.launch(kernels.share_rows, count, [rows, self._along, self._shared], device=device)
-        wp.launch(kernels.remove_rows, len(rows.touched), [rows, self._shared, x], device=device)
+        self._along.zero_()
+        self._launch(kernels.measure_rows, len(self._rows.node), [self._rows, x, self._along])
+        self._launch(kernels.share_rows, len(self._shared), [self._rows, self._along, self._shared])
+        self._launch(kernels.remove_rows, len(self._rows.node), [self._rows, self._shared, x])
 
     def launch_turning(self, x: wp.array, y: wp.array) -> None:
         """Launch y + G x."""
-        wp.launch(kernels.add_turning, len(self._rows.touched), [self._rows, x, y], device=self._body.device)
+        self._launch(add_products, len(self._couplings[0]), [*self._couplings, x, y])
 
     # --- on the host -------------------------------------------------------------------------------------------------
 
@@ -241,47 +223,126 @@ class RestingContact:
         """The derivative with respect to the places of obstacles, [obstacles, 3], from an adjoint motion and its
         multipliers."""
         found = np.zeros((self._contacts.obstacles.count, 3))
-        flat = motion.ravel()
-        for i, (lines, moved) in enumerate(self._moved):
-            if self.obstacle[i] < 0:
-                continue
-            found[self.obstacle[i]] += multipliers[i] * self.columns[i].normal + flat[lines] @ moved
+        for i, (nodes, moved) in enumerate(self._moved):
+            if self.obstacle[i] >= 0:
+                moved_by = np.einsum("ni,nij->j", motion[nodes], moved)
+                found[self.obstacle[i]] += multipliers[i] * self.columns[i].normal + moved_by
         return found
 
 
-class RestingOperator:
-    """S (A + G) of an operator A, for vectors in the range of the projector S that keeps to obstacles."""
+class PreciseContact:
+    """The contacts of one world in float64.
 
-    def __init__(self, operator: LinearOperator, contact: RestingContact):
-        self._operator, self._contact = operator, contact
+    Args:
+        resting: The contacts in float32.
+        shapes: The obstacles.
+        rest: Rest positions of a world's nodes [m], [N, 3].
+        world: The world.
 
-    def __getattr__(self, name: str) -> object:
-        return getattr(self._operator, name)
+    Raises:
+        InputError: A contact is not one of a node, or a place on an own surface, with a ``Ground`` or a ``Sphere``.
+    """
 
-    def apply(self, x: wp.array, y: wp.array) -> None:
-        self._operator.apply(x, y)
-        self._contact.launch_turning(x, y)
-        self._contact.launch_free(y)
+    def __init__(self, resting: RestingContact, shapes: tuple[Shape, ...], rest: Array, world: int):
+        self._rest, self._shapes = rest, shapes
+        for column in resting.columns:
+            if column.row.obstacle < 0 or len(column.row.places) > 1:
+                raise InputError("precision is 'float64'; contact must be at nodes, with obstacles")
+            shape = shapes[column.row.obstacle]
+            if column.yields and not isinstance(shape, Ground | Sphere):
+                raise InputError(
+                    f"precision is 'float64'; obstacles must be Ground or Sphere, and {column.row.obstacle} is "
+                    f"{shape!r}"
+                )
+        self._columns = [column for column in resting.columns if int(column.nodes[0]) // len(rest) == world]
+        self.count = len(self._columns)
+        self.pushes = np.array([float(column.row.force @ column.normal) for column in self._columns])
+
+    def gaps(self, u: Array) -> Array:
+        """The gaps at displacements u [m], [m]."""
+        return np.array([self._at(column, u)[0] for column in self._columns])
+
+    def normals(self, u: Array) -> csc_array:
+        """N, [3 N, m]."""
+        parts = [(self._nodes(column), np.outer(column.weights[0], self._at(column, u)[1])) for column in self._columns]
+        return normals_of(parts, len(self._rest))
+
+    def turning(self, u: Array, pushes: Array) -> csr_array:
+        """G, [3 N, 3 N]."""
+        blocks = []
+        for column, push in zip(self._columns, pushes, strict=True):
+            shares = np.outer(column.weights[0], column.weights[0])
+            blocks.append((self._nodes(column), shares[:, :, None, None] * (-push * self._at(column, u)[2])))
+        return turning_of(blocks, len(self._rest))
+
+    def of_obstacles(self, u: Array, pushes: Array, motion: Array, multipliers: Array) -> Array:
+        """The derivative with respect to the places of obstacles, [obstacles, 3], from an adjoint motion [N, 3]."""
+        found = np.zeros((len(self._shapes), 3))
+        for column, push, multiplier in zip(self._columns, pushes, multipliers, strict=True):
+            _, normal, bend = self._at(column, u)
+            moved = column.weights[0] @ motion[self._nodes(column)]
+            found[column.row.obstacle] += multiplier * normal - push * bend @ moved
+        return found
+
+    def _nodes(self, column: Column) -> npt.NDArray[np.int64]:
+        """The nodes that bear its place, numbered within the world."""
+        return column.nodes % len(self._rest)
+
+    def _at(self, column: Column, u: Array) -> tuple[float, Array, Array]:
+        """The gap of a contact, and its first and second derivative with respect to the place; if friction holds this,
+        the distance along the direction from where that is."""
+        x = column.weights[0] @ (self._rest + u)[self._nodes(column)]
+        if not column.yields:
+            return float(column.normal @ (x - column.row.point)), column.normal, np.zeros((3, 3))
+        shape = self._shapes[column.row.obstacle]
+        away = x - shape.position
+        if isinstance(shape, Ground):
+            up = axis_of(shape.quaternion)
+            return float(up @ away), up, np.zeros((3, 3))
+        distance = float(np.linalg.norm(away))
+        normal = away / distance
+        return distance - shape.size[0], normal, (np.eye(3) - np.outer(normal, normal)) / distance
 
 
-class RestingPreconditioner:
-    """S B S of a preconditioner B; ``update`` is B's."""
+# --- sparse matrices of contacts --------------------------------------------------------------------------------------
 
-    def __init__(self, preconditioner: Preconditioner, contact: RestingContact):
-        self._preconditioner, self._contact = preconditioner, contact
-        self._r: wp.array | None = None
 
-    def update(self, operator: LinearOperator) -> None:
-        self._preconditioner.update(operator)
+def joined_parts(parts: Sequence[tuple[Ints, Array]]) -> tuple[Ints, Ints, Array]:
+    """The contact, the node and the part [3] of each entry of N, from the nodes and parts of contacts."""
+    which = np.repeat(np.arange(len(parts)), [len(nodes) for nodes, _ in parts])
+    return which, np.concatenate([nodes for nodes, _ in parts]), np.concatenate([values for _, values in parts])
 
-    def apply(self, r: wp.array, z: wp.array) -> None:
-        if self._r is None:
-            self._r = wp.zeros_like(r)
-        # Rounding moves residuals out of the range of S.
-        wp.copy(self._r, r)
-        self._contact.launch_free(self._r)
-        self._preconditioner.apply(self._r, z)
-        self._contact.launch_free(z)
+
+def joined_blocks(blocks: Sequence[tuple[Ints, Array]]) -> tuple[Ints, Ints, Array]:
+    """The two nodes and the block [3, 3] of each entry of G, from the nodes and blocks [n, n, 3, 3] of contacts."""
+    first, second = (np.concatenate([of(nodes, len(nodes)) for nodes, _ in blocks]) for of in (np.repeat, np.tile))
+    return first, second, np.concatenate([block.reshape(-1, 3, 3) for _, block in blocks])
+
+
+def normals_of(parts: Sequence[tuple[Ints, Array]], count: int) -> csc_array:
+    """N of ``count`` nodes, [3 count, m]."""
+    from scipy.sparse import coo_array
+
+    which, nodes, values = joined_parts(parts)
+    places = (3 * nodes[:, None] + np.arange(3)).ravel(), np.repeat(which, 3)
+    return coo_array((values.ravel(), places), shape=(3 * count, len(parts))).tocsc()
+
+
+def turning_of(blocks: Sequence[tuple[Ints, Array]], count: int) -> csr_array:
+    """G, [3 count, 3 count]."""
+    from scipy.sparse import coo_array
+
+    first, second, values = joined_blocks(blocks)
+    axes = np.arange(3)
+    places = np.broadcast_arrays(3 * first[:, None, None] + axes[:, None], 3 * second[:, None, None] + axes)
+    lines, columns = (each.ravel() for each in places)
+    return coo_array((values.ravel(), (lines, columns)), shape=(3 * count, 3 * count)).tocsr()
+
+
+def by_nodes(matrix: Array) -> Array:
+    """A matrix [3 n, 3 n] as blocks [n, n, 3, 3]."""
+    n = len(matrix) // 3
+    return matrix.reshape(n, 3, n, 3).swapaxes(1, 2)
 
 
 # --- rows -------------------------------------------------------------------------------------------------------------
@@ -376,17 +437,3 @@ def rows_after(body: SoftBody, contacts: Contacts) -> list[ActingRow]:
     given = [row.obstacle for row in rows], world, x[:, None]
     normals = measured_gaps(contacts.obstacles.shapes, contacts.obstacles.motions.later, *given)[1][:, 0].astype(float)
     return [row._replace(point=p, normal=n) for row, p, n in zip(rows, x, normals, strict=True)]
-
-
-def _inverse(matrix: Array) -> Array:
-    """The inverse of N^T N; contacts that others contain share their forces with these."""
-    return np.asarray(np.linalg.pinv(matrix, rcond=DEPENDENT, hermitian=True), np.float64)
-
-
-def _ints(values: npt.ArrayLike, device: wp.Device) -> wp.array:
-    return wp.array(values, dtype=wp.int32, device=device)
-
-
-def _starts(owners: npt.NDArray[np.integer], count: int, device: wp.Device) -> wp.array:
-    """Where the entries of each owner begin, for sorted owners."""
-    return _ints(np.searchsorted(owners, np.arange(count + 1)), device)

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Sequence
-from typing import TYPE_CHECKING, Any, Protocol
+from collections.abc import Callable, Collection, Iterable, Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 import warp as wp
 
+from warp_corot.discretization.sizes import padded
 from warp_corot.elasticity import ForceField
 from warp_corot.elasticity.dilatation import DilatationField
-from warp_corot.elasticity.model import StressLaw, isotropic_material
+from warp_corot.elasticity.model import isotropic_material
 from warp_corot.errors import InputError
 from warp_corot.inputs.checks import shown
 from warp_corot.kernels.corotated.anisotropic import FibreMaterial
@@ -21,7 +22,6 @@ from warp_corot.kernels.gradients import steps
 
 if TYPE_CHECKING:
     from warp_corot.body.soft_body import SoftBody
-    from warp_corot.discretization.elements import Elements
 
 
 class ElementWork:
@@ -49,39 +49,51 @@ class ElementWork:
         if "activation" in names and law is not None and law.Material is not FibreMaterial:
             raise InputError("wrt has 'activation', but only anisotropic materials with Corotated have this derivative")
         count, nodes = field.element_count, field.discretization.sizes.launch_nodes
-        self._of_mu, self._of_lam, self._of_activation = (
-            wp.zeros(count if name in names else 0, dtype=wp.float64, device=self.device)
-            for name in ("lame", "lame", "activation")
-        )
-        self._of_rest = wp.zeros(nodes if "rest" in names else 0, dtype=wp.vec4, device=self.device)
+        needs = {"mu": "lame", "lam": "lame", "activation": "activation"}
+        self._sums = {
+            name: wp.zeros(count if need in names else 0, dtype=wp.float64, device=self.device)
+            for name, need in needs.items()
+        }
+        self._sums["rest"] = wp.zeros(nodes if "rest" in names else 0, dtype=wp.vec4, device=self.device)
         self._unit_mu, self._unit_lam = (self._lame(*pair) for pair in ((1.0, 0.0), (0.0, 1.0)))
 
     def add(self, u: wp.array, adjoint: wp.array, scale: float = 1.0) -> None:
         """Launch the sums of one pair; both vec4 [worlds * N]. ``scale`` multiplies all sums except "rest"."""
+        kind, shared, pair = self.field.discretization.element_kind, self._shared, [u, adjoint]
+        law: Any = (shared.shear if shared else self.field).stress_law
+        weights = None if shared is None or self.names <= {"activation"} else shared.share_weights(u, adjoint)
         if "lame" in self.names:
-            self._add_lame(u, adjoint, scale)
+            kernel = kernels.add_stress_work(kind, IsotropicMaterial, law.stress)
+            self._launch(kernel, [self._unit_mu, *pair, scale], "mu")
+            if shared is None:
+                self._launch(kernel, [self._unit_lam, *pair, scale], "lam")
+            else:
+                self._launch(kernels.add_dilatation_work(kind, shared.of), [weights, *pair, scale], "lam")
         if "activation" in self.names:
-            kernel = kernels.add_fibre_work(self._kind)
-            self._launch(kernel, [self._law.material, u, adjoint, scale], self._of_activation)
+            self._launch(kernels.add_fibre_work(kind), [law.material, *pair, scale], "activation")
         if "rest" in self.names:
-            self._add_rest(u, adjoint)
+            kernel = kernels.add_rest_work(kind, law.Material, law.stress, law.differential)
+            self._launch(kernel, [law.material, *pair], "rest")
+            if shared is not None:
+                kernel = kernels.add_dilatation_rest_work(kind, shared.of)
+                self._launch(kernel, [shared.isotropic, weights, *pair], "rest")
 
     def clear(self) -> None:
         """Begin the sums again."""
-        for array in (self._of_mu, self._of_lam, self._of_activation, self._of_rest):
+        for array in self._sums.values():
             array.zero_()
 
     def of_lame(self) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
         """The derivatives with respect to mu and lambda of forces, float64 [worlds * T]."""
-        return self._of_mu.numpy(), self._of_lam.numpy()
+        return self._sums["mu"].numpy(), self._sums["lam"].numpy()
 
     def of_activation(self) -> npt.NDArray[np.float64]:
         """The derivative with respect to active stress, float64 [worlds * T]."""
-        return np.asarray(self._of_activation.numpy())
+        return np.asarray(self._sums["activation"].numpy())
 
     def of_rest(self) -> npt.NDArray[np.float64]:
         """The derivative with respect to rest positions, float64 [worlds * N, 3]."""
-        return np.asarray(self._of_rest.numpy()[: self.field.discretization.sizes.nodes, :3], np.float64)
+        return self._nodal("rest")
 
     def of_weights(self, densities: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
         """The derivative with respect to rest positions of the work of weights, float64 [worlds * N, 3].
@@ -89,47 +101,21 @@ class ElementWork:
         Args:
             densities: Density of that work in elements [J/m^3], [worlds * T].
         """
-        discretization = self.field.discretization
-        rest = wp.zeros(discretization.sizes.launch_nodes, dtype=wp.vec4, device=self.device)
+        count = self.field.discretization.sizes.launch_nodes
+        self._sums["weights"] = wp.zeros(count, dtype=wp.vec4, device=self.device)
         on_device = wp.array(densities, dtype=wp.float32, device=self.device)
-        self._launch(kernels.add_rest_weight(self._kind), [on_device], rest)
-        return np.asarray(rest.numpy()[: discretization.sizes.nodes, :3], np.float64)
+        self._launch(kernels.add_rest_weight(self.field.discretization.element_kind), [on_device], "weights")
+        return self._nodal("weights")
 
-    def _add_lame(self, u: wp.array, adjoint: wp.array, scale: float) -> None:
-        kernel = kernels.add_stress_work(self._kind, IsotropicMaterial, self._law.stress)
-        self._launch(kernel, [self._unit_mu, u, adjoint, scale], self._of_mu)
-        if self._shared is None:
-            self._launch(kernel, [self._unit_lam, u, adjoint, scale], self._of_lam)
-        else:
-            shared = self._shared.share_weights(u, adjoint)
-            kernel = kernels.add_dilatation_work(self._kind, self._shared.of)
-            self._launch(kernel, [shared, u, adjoint, scale], self._of_lam)
-
-    def _add_rest(self, u: wp.array, adjoint: wp.array) -> None:
-        law = self._law
-        kernel = kernels.add_rest_work(self._kind, law.Material, law.stress, law.differential)
-        self._launch(kernel, [law.material, u, adjoint], self._of_rest)
-        if self._shared is not None:
-            shared = self._shared.share_weights(u, adjoint)
-            kernel = kernels.add_dilatation_rest_work(self._kind, self._shared.of)
-            self._launch(kernel, [self._shared.isotropic, shared, u, adjoint], self._of_rest)
-
-    @property
-    def _law(self) -> StressLaw:
-        law = (self._shared.shear if self._shared else self.field).stress_law
-        assert law is not None
-        return law
-
-    @property
-    def _kind(self) -> type:
-        return self.field.discretization.element_kind
+    def _nodal(self, name: str) -> npt.NDArray[np.float64]:
+        return np.asarray(self._sums[name].numpy()[: self.field.discretization.sizes.nodes, :3], np.float64)
 
     def _lame(self, mu: float, lam: float) -> IsotropicMaterial:
         return isotropic_material([*(wp.full(1, v, dtype=wp.float32, device=self.device) for v in (mu, lam)), 0])
 
-    def _launch(self, kernel: wp.Kernel, inputs: list, output: wp.array) -> None:
-        elements: Elements = self.field.discretization.elements
-        wp.launch(kernel, self.field.element_count, [elements, *inputs], [output], device=self.device)
+    def _launch(self, kernel: wp.Kernel, inputs: list, name: str) -> None:
+        given = [self.field.discretization.elements, *inputs, self._sums[name]]
+        wp.launch(kernel, self.field.element_count, given, device=self.device)
 
 
 def _listed(names: set[str]) -> str:
@@ -158,7 +144,7 @@ class StepSums:
         like, count = body.state.displacements, body.sizes.nodes
         self.loads, self.of_loads, self._forces = (wp.zeros_like(like) for _ in range(3))
         if body.conditions.has_loads:
-            self.loads[:count].assign(_four(body.conditions.loads.numpy()[:count, :3]))
+            self.loads[:count].assign(padded(body.conditions.loads.numpy()[:count, :3]))
         self._wants_mass = bool({"density", "rest"} & set(names))
         self._of_mass = wp.zeros(len(like), dtype=wp.float64, device=body.device)
 
@@ -186,63 +172,32 @@ class StepSums:
         return derivatives(self.body, self.work, self.names, moved, self._of_mass.numpy()[:count])
 
 
-class Work(Protocol):
-    """Sums of elements; see ``ElementWork``."""
-
-    def of_lame(self) -> tuple[Array, Array]: ...
-
-    def of_activation(self) -> Array: ...
-
-    def of_rest(self) -> Array: ...
-
-    def of_weights(self, densities: Array) -> Array: ...
-
-
-def derivatives(body: SoftBody, work: Work, names: Sequence[str], moved: Array, of_mass: Array) -> dict[str, Any]:
+def derivatives(body: SoftBody, work: Any, names: Sequence[str], moved: Array, of_mass: Array) -> dict[str, Any]:
     """Derivatives of these names from sums.
 
     Args:
         body: The body.
-        work: The sums of elements.
+        work: The sums of elements, an ``ElementWork`` or what has the same results.
         names: Any except "boundary" and those of an initial state; "rest" is the derivative at constant positions.
         moved: The sum of adjoint motions, [worlds * N, 3].
         of_mass: The derivative with respect to the mass of each node, [worlds * N].
     """
-    found: dict[str, Any] = {}
-    for name in names:
-        if name == "loads":
-            found[name] = moved
-        elif name == "gravity":
-            found[name] = body.masses @ moved
-        elif name == "young":
-            found[name] = of_young(body, *work.of_lame())
-        elif name == "poisson":
-            found[name] = of_poisson(body, *work.of_lame())
-        elif name == "density":
-            found[name] = of_density(body, of_mass)
-        elif name == "activation":
-            found[name] = work.of_activation().reshape(body.worlds, -1)
-        elif name == "rest":
-            found[name] = work.of_rest() + work.of_weights(weight_densities(body, of_mass))
-    return found
+    found: dict[str, Callable[[], Any]] = {
+        "loads": lambda: moved,
+        "gravity": lambda: body.masses @ moved,
+        "young": lambda: of_modulus(body, "young", *work.of_lame()),
+        "poisson": lambda: of_modulus(body, "poisson", *work.of_lame()),
+        "density": lambda: of_density(body, of_mass),
+        "activation": lambda: work.of_activation().reshape(body.worlds, -1),
+        "rest": lambda: work.of_rest() + work.of_weights(weight_densities(body, of_mass)),
+    }
+    return {name: found[name]() for name in names if name in found}
 
 
-def _four(values: npt.NDArray[Any]) -> npt.NDArray[np.float32]:
-    return np.pad(values.astype(np.float32), ((0, 0), (0, 1)))
-
-
-#: The sums of ``ElementWork`` that each of these needs.
-NEEDS = {
-    "young": "lame",
-    "poisson": "lame",
-    "rest": "rest",
-    "activation": "activation",
-    "density": None,
-    "loads": None,
-    "boundary": None,
-    "gravity": None,
-    "obstacles": None,
-}
+#: Names of derivatives of static answers, and the sums of ``ElementWork`` that each of them needs.
+NEEDS = {"young": "lame", "poisson": "lame", "rest": "rest", "activation": "activation"} | dict.fromkeys(
+    ("density", "loads", "boundary", "gravity", "obstacles")
+)
 
 
 def needed(names: Sequence[str]) -> set[str]:
@@ -278,19 +233,16 @@ def requested(found: object, name: str, known: Collection[str]) -> Any:
     return getattr(found, name)
 
 
-def of_young(body: SoftBody, of_mu: Array, of_lam: Array) -> Array | float:
-    """The derivative with respect to Young's modulus, in the shape of the material's value."""
-    _, nu = _young_and_poisson(body)
-    d_mu, d_lam = 1.0 / (2.0 * (1.0 + nu)), nu / ((1.0 + nu) * (1.0 - 2.0 * nu))
-    return _of_shape(body, "young", d_mu * _filled(body, of_mu) + d_lam * _filled(body, of_lam))
-
-
-def of_poisson(body: SoftBody, of_mu: Array, of_lam: Array) -> Array | float:
-    """The derivative with respect to Poisson's ratio, in the shape of the material's value."""
-    young, nu = _young_and_poisson(body)
-    d_mu = -young / (2.0 * (1.0 + nu) ** 2)
-    d_lam = young * (1.0 + 2.0 * nu**2) / ((1.0 + nu) * (1.0 - 2.0 * nu)) ** 2
-    return _of_shape(body, "poisson", d_mu * _filled(body, of_mu) + d_lam * _filled(body, of_lam))
+def of_modulus(body: SoftBody, name: str, of_mu: Array, of_lam: Array) -> Array | float:
+    """The derivative with respect to Young's modulus or Poisson's ratio, in the shape of the material's value."""
+    material = body.material.isotropic
+    young, nu = (np.asarray(value, np.float64) for value in (material.young, material.poisson))
+    if name == "young":
+        d_mu, d_lam = 1.0 / (2.0 * (1.0 + nu)), nu / ((1.0 + nu) * (1.0 - 2.0 * nu))
+    else:
+        d_mu = -young / (2.0 * (1.0 + nu) ** 2)
+        d_lam = young * (1.0 + 2.0 * nu**2) / ((1.0 + nu) * (1.0 - 2.0 * nu)) ** 2
+    return _of_shape(body, name, d_mu * _filled(body, of_mu) + d_lam * _filled(body, of_lam))
 
 
 def of_density(body: SoftBody, work: Array) -> Array | float:
@@ -313,11 +265,6 @@ def means_of_elements(body: SoftBody, values: Array) -> Array:
     return np.asarray(values.reshape(body.worlds, -1)[:, body.mesh.tets].mean(axis=2))
 
 
-def _young_and_poisson(body: SoftBody) -> tuple[Array, Array]:
-    material = body.material.isotropic
-    return np.asarray(material.young, np.float64), np.asarray(material.poisson, np.float64)
-
-
 def _filled(body: SoftBody, values: Array) -> Array:
     """Values of elements times their filled fraction, [worlds, T]."""
     fill = body.discretization.fill
@@ -330,12 +277,7 @@ def _of_shape(body: SoftBody, name: str, values: Array) -> Array | float:
     value of many elements is a sum over them.
     """
     shape = np.shape(getattr(body.material, name))
-    if shape == ():
-        return float(values.sum())
-    if len(shape) == 1:
-        values = values.sum(axis=0)
-        return values if shape == values.shape else values.sum(keepdims=True)
-    for axis, count in enumerate(shape):
+    for axis, count in enumerate((1,) * (values.ndim - len(shape)) + shape):
         if count == 1:
             values = values.sum(axis=axis, keepdims=True)
-    return values
+    return values.reshape(shape) if shape else float(values.sum())

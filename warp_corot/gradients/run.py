@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -16,12 +16,13 @@ from warp_corot.body.soft_body import SoftBody
 from warp_corot.contact.options import Contact
 from warp_corot.contact.shapes import Shape
 from warp_corot.discretization.sizes import padded
-from warp_corot.elasticity import Corotated, ForceField, Model
+from warp_corot.elasticity import Corotated, Model
 from warp_corot.errors import InputError, UnstableError
 from warp_corot.inputs.checks import checked_count, refuse_tape, shown
 from warp_corot.inputs.simulation_lock import under_lock
 from warp_corot.kernels.gradients import steps as kernels
 from warp_corot.kernels.implicit import steps as rows
+from warp_corot.kernels.stepping.stability import add_scaled
 from warp_corot.simulation.parts import checked_gravity, checked_models
 from warp_corot.simulation.resting import checked_obstacles
 from warp_corot.simulation.simulation import Simulation
@@ -37,165 +38,187 @@ from .objective import Objective, value_and_derivative
 from .parameters import StepSums
 from .static import bound, friction_of
 
+Array = npt.NDArray[np.float64]
+
+
+class Seen:
+    """The sum of an objective's values after some of the steps of a run.
+
+    Args:
+        body, objective: The body, and the function of its positions.
+        steps: Number of steps.
+        every: The objective is seen after each of this number of steps; None: at the end.
+
+    Attributes:
+        marks: The numbers of the steps after which it is seen.
+        value: The sum so far.
+    """
+
+    def __init__(self, body: SoftBody, objective: Objective, steps: int, every: int | None):
+        self.body, self._objective, self.steps, self.value = body, objective, steps, 0.0
+        self.marks = {steps} if every is None else {*range(checked_count(every, "every", least=1), steps + 1, every)}
+        if not self.marks:
+            raise InputError(f"every is {every}; the run has {steps} steps")
+
+    def derivative(self, step: int, u: wp.array) -> Array:
+        """The derivative at displacements u after a step, [worlds * N, 3], whose value is added to the sum; zero if it
+        is not seen there."""
+        if step not in self.marks:
+            return np.zeros((self.body.sizes.nodes, 3))
+        positions = self.body.rest_positions + u.numpy()[: self.body.sizes.nodes, :3]
+        on_device = wp.array(positions, dtype=wp.vec3, device=self.body.device)
+        value, derivative = value_and_derivative(self._objective, on_device)
+        self.value += value
+        return derivative
+
 
 class ExplicitRun:
     """Steps of symplectic Euler of one body, from its present state.
 
     Only states at the beginnings of segments are kept. The other states of a segment are computed again when it is run
     backwards. So there are two runs forwards in all, and memory for the states of one segment and for one state of each
-    segment.
+    segment: about sqrt(steps) each.
 
     Args:
-        body, field: The body and its elastic forces.
+        sums: The sums over steps, of a body and its elastic forces.
+        seen: The objective.
         integrator: The integrator, with a given step.
         gravity: [m/s^2].
-        sums: The sums over steps.
-        ends: The numbers of steps at which segments end, increasing; the last one is the end of the run.
 
     Attributes:
-        displacements, velocities: At the beginning, and at each of the ends, vec4 each.
-        of_displacements, of_velocities: The adjoint of the state that the run backwards has reached, vec4.
+        kept: The largest number of states in memory.
     """
 
-    def __init__(
-        self,
-        body: SoftBody,
-        field: ForceField,
-        integrator: SymplecticEuler,
-        gravity: Sequence[float],
-        sums: StepSums,
-        ends: Sequence[int],
-    ):
-        self.body, self.field, self.sums, self.device = body, field, sums, body.device
-        self.lengths = np.diff([0, *ends]).tolist()
+    def __init__(self, sums: StepSums, seen: Seen, integrator: SymplecticEuler, gravity: Sequence[float]):
+        self.body, self.field, self.sums, self._seen = sums.body, sums.field, sums, seen
+        length = math.isqrt(seen.steps - 1) + 1
+        self._ends = sorted({*range(length, seen.steps, length), *seen.marks, seen.steps})
+        self._lengths = np.diff([0, *self._ends]).tolist()
+        self.kept = len(self._ends) + 1 + max(self._lengths)
         assert integrator.dt is not None
         self._dt, self._damped = integrator.dt, 1.0 / (1.0 + integrator.dt * integrator.damping)
-        self._gravity, self._tangent = wp.vec3(*gravity), field.tangent(exact=True)
-        state = body.state
+        self._gravity, self._tangent = wp.vec3(*gravity), self.field.tangent(exact=True)
+        state = self.body.state
         self._u, self._v = wp.clone(state.displacements), wp.clone(state.velocities)
-        self.of_displacements, self.of_velocities, self._p, self._product, self._f = (
-            wp.zeros_like(self._u) for _ in range(5)
-        )
-        self._kept = [wp.zeros_like(self._u) for _ in range(max(self.lengths))]
-        self.displacements, self.velocities = [wp.clone(self._u)], [wp.clone(self._v)]
-        self._replays = Replays(self.device)
+        self._of_u, self._of_v, self._p, self._product, self._f = (wp.zeros_like(self._u) for _ in range(5))
+        self._states = [wp.zeros_like(self._u) for _ in range(max(self._lengths))]
+        self._replays = Replays(self.body.device)
         self._tangent.prepare(self._u)
 
-    def forward(self) -> None:
-        """Run to the end, and leave the body in that state."""
-        for length in self.lengths:
+    def adjoint(self) -> tuple[Array, Array]:
+        """The adjoints of displacements and velocities at the beginning, [worlds * N, 3]; the body is left at the end
+        of the run."""
+        begins = []
+        for length in self._lengths:
+            begins.append((wp.clone(self._u), wp.clone(self._v)))
             self._replays.launch(("forward", length), partial(self._forward, length))
-            self.displacements.append(wp.clone(self._u))
-            self.velocities.append(wp.clone(self._v))
-        state = self.body.state
+        state, count = self.body.state, self.body.sizes.nodes
         wp.copy(state.displacements, self._u)
         wp.copy(state.velocities, self._v)
         state.publish_positions()
-
-    def backward(self, segment: int) -> None:
-        """Run a segment backwards, after the segments that follow it."""
-        length = self.lengths[segment]
-        wp.copy(self._u, self.displacements[segment])
-        wp.copy(self._v, self.velocities[segment])
-        self._replays.launch(("forward", length), partial(self._forward, length))
-        self._replays.launch(("backward", length), partial(self._backward, length))
+        self.sums.clear()
+        check_finite(self.body)
+        ends = [*(u for u, _ in begins[1:]), wp.clone(self._u)]
+        for end, length, begin, after in reversed(list(zip(self._ends, self._lengths, begins, ends, strict=True))):
+            added = self._of_u.numpy()[:count, :3] + self._seen.derivative(end, after)
+            self._of_u[:count].assign(padded(added))
+            wp.copy(self._u, begin[0])
+            wp.copy(self._v, begin[1])
+            self._replays.launch(("forward", length), partial(self._forward, length))
+            self._replays.launch(("backward", length), partial(self._backward, length))
+        of_u, of_v = (a.numpy()[:count, :3].astype(np.float64) for a in (self._of_u, self._of_v))
+        return of_u, of_v
 
     def _forward(self, length: int) -> None:
         conditions = self.body.conditions
         inputs = [self._dt, self._damped, self._gravity, conditions.inverse_mass, self.sums.loads]
         for step in range(length):
-            wp.copy(self._kept[step], self._u)
+            wp.copy(self._states[step], self._u)
             self.field.add_forces(self._u, self._f)
             self._launch(kernels.take_explicit_step, inputs, [self._f, self._u, self._v])
 
     def _backward(self, length: int) -> None:
-        inputs = [self._dt, self._damped, self.body.conditions.inverse_mass, self.of_displacements]
-        outputs = [self.of_velocities, self.sums.of_loads, self._p]
+        inputs = [self._dt, self._damped, self.body.conditions.inverse_mass, self._of_u]
         for step in reversed(range(length)):
-            u = self._kept[step]
-            self._launch(kernels.begin_explicit_adjoint, inputs, outputs)
+            u = self._states[step]
+            self._launch(kernels.begin_explicit_adjoint, inputs, [self._of_v, self.sums.of_loads, self._p])
             self.sums.add(u, self._p)
             self._product.zero_()
             self._tangent.take(u)
             self._tangent.add_product(self._p, self._product)
-            self._launch(kernels.subtract, [self._product], [self.of_displacements])
+            self._launch(add_scaled, [-1.0, self._product], [self._of_u])
 
     def _launch(self, kernel: wp.Kernel, inputs: list, outputs: list) -> None:
-        wp.launch(kernel, self.body.sizes.launch_nodes, inputs, outputs, device=self.device)
-
-
-Array = npt.NDArray[np.float64]
+        wp.launch(kernel, self.body.sizes.launch_nodes, inputs, outputs, device=self.body.device)
 
 
 class ImplicitRun:
-    """The adjoints of implicit steps of one body.
+    """Implicit steps of one body, of which all displacements are kept.
 
     A step finds its increment d at the stage u + d from M (A0 d + A1 v + A2 h1 + A3 h2) + damping M (R0 d + R1 v + …) =
     f(u + d) + loads, and leaves u + d / share and sums of d, v, h1 and h2; see ``kernels.implicit.steps``.
 
     Args:
-        body, field: The body and its elastic forces.
-        integrator: The integrator of the steps.
-        sums: The sums over steps.
-        displacements: The displacements before the first step and after each step, vec4.
+        sums: The sums over steps, of a body and its elastic forces.
+        seen: The objective.
+        sim: The simulation that makes the steps.
+        obstacles: Number of obstacles.
         tolerance: Tolerance of the adjoint solves.
-        contacts: What obstacles have pushed in each step, if there are any obstacles.
 
     Attributes:
-        of_obstacles: The derivative with respect to the places of the obstacles, or 0.
-        of_displacements, of_velocities: The adjoint of the state that the run backwards has reached, float64
-            [worlds * N, 3].
+        kept: The largest number of states in memory.
+        of_obstacles: The derivative with respect to the places of the obstacles, [obstacles, 3].
     """
 
-    def __init__(
-        self,
-        body: SoftBody,
-        field: ForceField,
-        integrator: ImplicitIntegrator,
-        sums: StepSums,
-        displacements: list[wp.array],
-        tolerance: float,
-        contacts: Sequence[RestingContact] = (),
-    ):
-        self._contacts, self.of_obstacles = contacts, np.zeros(1)
-        self.body, self.sums, self.displacements = body, sums, displacements
-        self._adjoint = Adjoint(body, field, integrator.preconditioner, tolerance)
-        self._dt, self._damping = integrator.dt, integrator.damping
-        self._tables = [np.asarray(table(integrator.dt), np.float64) for table in (integrator.start, integrator.scheme)]
-        self._held = body.conditions.held_mask()[:, None]
-        self._masses = body.masses[:, None]
-        self.of_displacements, self.of_velocities, self._of_first, self._of_second = (
-            np.zeros((body.sizes.nodes, 3)) for _ in range(4)
-        )
+    def __init__(self, sums: StepSums, seen: Seen, sim: Simulation, obstacles: int, tolerance: float):
+        self.body, self.sums, self._seen, self._sim, self.kept = sums.body, sums, seen, sim, seen.steps + 1
+        self.of_obstacles = np.zeros((obstacles, 3))
+        scheme = sim.integrator
+        assert isinstance(scheme, ImplicitIntegrator)
+        self._adjoint = Adjoint(self.body, sums.field, scheme.preconditioner, tolerance)
+        self._dt, self._damping = scheme.dt, scheme.damping
+        self._tables = [np.asarray(table(scheme.dt), np.float64) for table in (scheme.start, scheme.scheme)]
+        self._held = self.body.conditions.held_mask()[:, None]
+        self._masses = self.body.masses[:, None]
+        self._of_u, *self._of_made = (np.zeros((self.body.sizes.nodes, 3)) for _ in range(4))
 
-    def backward(self, step: int) -> None:
-        """Run a step backwards, 0 for the first one, after the steps that follow it."""
-        table = self._tables[min(step, 1)]
+    def adjoint(self) -> tuple[Array, Array]:
+        """As ``ExplicitRun.adjoint``."""
+        body, sim, steps = self.body, self._sim, self._seen.steps
+        states, contacts, friction = [wp.clone(body.state.displacements)], [], [0.0] * len(self.of_obstacles)
+        for _ in range(steps):
+            sim.step()
+            states.append(wp.clone(body.state.displacements))
+            if sim.contact is not None:
+                contacts.append(RestingContact(body, sim.contact, rows_after(body, sim.contact), friction))
+        check_finite(body)
+        for step in reversed(range(steps)):
+            self._of_u = self._of_u + self._seen.derivative(step + 1, states[step + 1])
+            contact = contacts[step] if contacts and contacts[step].pushes else None
+            self._backward(self._tables[min(step, 1)], states[step], states[step + 1], contact)
+        return self._of_u, self._of_made[0]
+
+    def _backward(self, table: Array, begin: wp.array, end: wp.array, contact: RestingContact | None) -> None:
+        """Run a step of this scheme backwards."""
         stage_share = table[int(rows.STAGE), 0]
-        before, after = (self.displacements[k].numpy()[:, :3].astype(np.float64) for k in (step, step + 1))
+        before, after = (u.numpy()[:, :3].astype(np.float64) for u in (begin, end))
         stage = wp.array(padded(before + stage_share * (after - before)), dtype=wp.vec4, device=self.body.device)
         inertia = table[int(rows.ACCELERATION)] + self._damping * table[int(rows.RATE)]
-        made = [table[int(row)] for row in (rows.VELOCITY, rows.FIRST, rows.SECOND)]
-        of_made = (self.of_velocities, self._of_first, self._of_second)
-        right = self.of_displacements / stage_share + sum(row[0] * of for row, of in zip(made, of_made, strict=True))
-        contact = self._contacts[step] if self._contacts and self._contacts[step].pushes else None
-        self._adjoint.keep_to(contact)
+        # The parts of d, v, h1 and h2 in the adjoints of v, h1 and h2 after the step.
+        made = np.array([table[int(row)] for row in (rows.VELOCITY, rows.FIRST, rows.SECOND)])
+        parts = np.einsum("rc,rni->cni", made, np.array(self._of_made))
+        self._adjoint.contact = contact
         self._adjoint.take(stage, inertia[0])
-        motion, product = self._adjoint.solve(np.where(self._held, 0.0, right))
+        motion, product = self._adjoint.solve(np.where(self._held, 0.0, self._of_u / stage_share + parts[0]))
         p = motion.numpy()[:, :3].astype(np.float64)
         if contact is not None:
             self.of_obstacles = self.of_obstacles + contact.of_obstacles(p, self._adjoint.multipliers)
-        of_u = self.of_displacements - product
+        parts = np.where(self._held, 0.0, parts - inertia[: len(parts), None, None] * self._masses * p)
         # Held nodes keep their velocity and move with it; at the stage they have made the stage's fraction of that
         # motion.
-        moved = self._dt * (self.of_displacements - stage_share * product)
-        of_v = np.where(self._held, self.of_velocities + moved, 0.0)
-        parts = []
-        for column in (1, 2, 3):
-            part = sum(row[column] * of for row, of in zip(made, of_made, strict=True))
-            parts.append(np.where(self._held, 0.0, part - inertia[column] * self._masses * p))
-        self.of_displacements, self.of_velocities = of_u, of_v + parts[0]
-        self._of_first, self._of_second = parts[1], parts[2]
+        moved = self._of_made[0] + self._dt * (self._of_u - stage_share * product)
+        self._of_made = [parts[1] + np.where(self._held, moved, 0.0), parts[2], parts[3]]
+        self._of_u = self._of_u - product
         self.sums.add(stage, motion)
         added = wp.array(padded(self.sums.of_loads.numpy()[:, :3] + p), dtype=wp.vec4, device=self.body.device)
         wp.copy(self.sums.of_loads, added)
@@ -294,89 +317,19 @@ def run_gradient(
         )
     down = checked_gravity(gravity, body.mesh.up_axis)
     body.state.adopt_positions()
-    sums = StepSums(body, field, names)
-    marks = {steps} if every is None else {*range(checked_count(every, "every", least=1), steps + 1, every)}
-    if not marks:
-        raise InputError(f"every is {every}; the run has {steps} steps")
-    given = _Run(sums, steps, marks, down, _Values(body, objective))
-    of_obstacles = np.zeros((len(things), 3))
+    sums, seen = StepSums(body, field, names), Seen(body, objective, steps, every)
+    run: ExplicitRun | ImplicitRun
     if isinstance(integrator, SymplecticEuler):
-        kept, of_u, of_v = _explicit(given, integrator)
+        run = ExplicitRun(sums, seen, integrator, down)
     else:
-        assert isinstance(integrator, ImplicitIntegrator)
         sim = Simulation(body, model=law, integrator=integrator, gravity=down, obstacles=things, contact=contact)
-        run = _implicit(given, integrator, sim, len(things), adjoint_tolerance)
-        kept, of_u, of_v = steps + 1, run.of_displacements, run.of_velocities
-        of_obstacles = of_obstacles + run.of_obstacles
+        run = ImplicitRun(sums, seen, sim, len(things), adjoint_tolerance)
+    of_u, of_v = run.adjoint()
+    of_obstacles = run.of_obstacles if isinstance(run, ImplicitRun) else np.zeros((len(things), 3))
     found = sums.derivatives() | {"displacements": of_u, "velocities": of_v, "obstacles": of_obstacles}
     if "rest" in names:
         found["rest"] = found["rest"] + of_u
-    return RunGradient(given.seen.value, kept, **{name: found[name] for name in names})
-
-
-class _Run(NamedTuple):
-    """What both kinds of steps need: the sums, the number of steps, the steps after which the objective is seen,
-    gravity, and the objective's values."""
-
-    sums: StepSums
-    steps: int
-    marks: set[int]
-    gravity: tuple[float, float, float]
-    seen: _Values
-
-
-def _explicit(given: _Run, integrator: SymplecticEuler) -> tuple[int, Array, Array]:
-    """The number of kept states, and the adjoint of the beginning."""
-    sums, steps, marks, gravity, seen = given
-    body, length = sums.body, math.isqrt(steps - 1) + 1
-    ends = sorted({*range(length, steps, length), *marks, steps})
-    run = ExplicitRun(body, sums.field, integrator, gravity, sums, ends)
-    run.forward()
-    sums.clear()
-    check_finite(body)
-    count = body.sizes.nodes
-    for segment in reversed(range(len(ends))):
-        if ends[segment] in marks:
-            added = run.of_displacements.numpy()[:count, :3] + seen.derivative(run.displacements[segment + 1])
-            run.of_displacements[:count].assign(padded(added))
-        run.backward(segment)
-    of_u, of_v = (a.numpy()[:count, :3].astype(np.float64) for a in (run.of_displacements, run.of_velocities))
-    return len(run.displacements) + max(run.lengths), of_u, of_v
-
-
-def _implicit(
-    given: _Run, integrator: ImplicitIntegrator, sim: Simulation, obstacles: int, tolerance: float
-) -> ImplicitRun:
-    """The run backwards of implicit steps, at the beginning."""
-    sums, body = given.sums, given.sums.body
-    states, contacts, friction = [wp.clone(body.state.displacements)], [], [0.0] * obstacles
-    for _ in range(given.steps):
-        sim.step()
-        states.append(wp.clone(body.state.displacements))
-        if sim.contact is not None:
-            contacts.append(RestingContact(body, sim.contact, rows_after(body, sim.contact), friction))
-    check_finite(body)
-    run = ImplicitRun(body, sums.field, integrator, sums, states, tolerance, contacts)
-    for step in reversed(range(given.steps)):
-        if step + 1 in given.marks:
-            run.of_displacements = run.of_displacements + given.seen.derivative(states[step + 1])
-        run.backward(step)
-    return run
-
-
-class _Values:
-    """The sum of an objective's values."""
-
-    def __init__(self, body: SoftBody, objective: Objective):
-        self.body, self.objective, self.value = body, objective, 0.0
-
-    def derivative(self, u: wp.array) -> Array:
-        """The derivative at displacements u, [worlds * N, 3]; the value is added to the sum."""
-        positions = self.body.rest_positions + u.numpy()[: self.body.sizes.nodes, :3]
-        on_device = wp.array(positions, dtype=wp.vec3, device=self.body.device)
-        value, derivative = value_and_derivative(self.objective, on_device)
-        self.value += value
-        return derivative
+    return RunGradient(seen.value, run.kept, **{name: found[name] for name in names})
 
 
 def check_finite(body: SoftBody) -> None:

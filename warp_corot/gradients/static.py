@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -24,12 +25,9 @@ from warp_corot.simulation.static import StaticReport, static_answer
 
 from . import parameters
 from .adjoint import Adjoint
-from .contact import RestingContact
+from .contact import PreciseContact, RestingContact
 from .objective import Objective, value_and_derivative
 from .parameters import ElementWork, derivatives
-
-if TYPE_CHECKING:
-    from warp_corot.solvers.implicit.precise import PreciseElements
 
 Array = npt.NDArray[np.float64]
 
@@ -115,18 +113,13 @@ class RestState:
         motion, product = adjoint.solve(np.where(held, 0.0, given))
         boundary = np.where(held, given - product, 0.0)
         self.adjoint_iterations, self.adjoint_residual = adjoint.iterations, adjoint.residual
-        return self._derivatives(names, motion, boundary)
-
-    def _derivatives(self, names: Sequence[str], motion: wp.array, boundary: Array) -> dict[str, Any]:
-        """The derivatives from an adjoint motion, vec4, and the derivative with respect to the boundary."""
-        body, gravity = self.body, self.gravity
-        moved = motion.numpy()[: body.sizes.nodes, :3].astype(np.float64)
+        moved = motion.numpy()[:count, :3].astype(np.float64)
         work = ElementWork(self.field, parameters.needed(names))
-        work.add(body.state.displacements, motion)
+        work.add(self.body.state.displacements, motion)
         of_obstacles = np.zeros((len(self.obstacles), 3))
-        if self.contact is not None and self._adjoint is not None:
-            of_obstacles = self.contact.of_obstacles(moved, self._adjoint.multipliers)
-        found = derivatives(body, work, names, moved, moved @ gravity)
+        if self.contact is not None:
+            of_obstacles = self.contact.of_obstacles(moved, adjoint.multipliers)
+        found = derivatives(self.body, work, names, moved, moved @ self.gravity)
         return found | _of_places(found, names, boundary, of_obstacles)
 
 
@@ -327,8 +320,6 @@ class PreciseState:
     def __init__(self, solved: RestState):
         from warp_corot.solvers.implicit.precise import PreciseRest
 
-        from .precise_contact import PreciseContact
-
         body, self._gravity = solved.body, solved.gravity
         self.body, self.report = body, solved.report
         loads = body.conditions.loads_and_weights(solved.gravity)
@@ -365,29 +356,15 @@ class PreciseState:
                 pushes = self._rest.pushes[world]
                 of_obstacles += contact.of_obstacles(u, pushes, moved[world], multipliers)
             boundary[world] = np.where(held[:, None], given[world] - product.reshape(-1, 3), 0.0)
-        work = _Work(self._rest.elements, self._rest.u, moved)
-        flat = moved.reshape(-1, 3)
+        elements, flat = self._rest.elements, moved.reshape(-1, 3)
+        of_worlds = [each.work(*pair) for each, *pair in zip(elements, self._rest.u, moved, strict=True)]
+        of_mu, of_lam, of_rest = (np.concatenate(values) for values in zip(*of_worlds, strict=True))
+
+        def of_weights(densities: Array) -> Array:
+            each = zip(elements, densities.reshape(len(elements), -1, 1, 1) * np.eye(3), strict=True)
+            return np.concatenate([one.scatter(-density) for one, density in each])
+
+        # As an ``ElementWork``.
+        work = SimpleNamespace(of_lame=lambda: (of_mu, of_lam), of_rest=lambda: of_rest, of_weights=of_weights)
         found = derivatives(self.body, work, names, flat, flat @ self._gravity)
         return found | _of_places(found, names, boundary.reshape(-1, 3), of_obstacles)
-
-
-class _Work:
-    """The work of elements' forces in adjoint motions, in all worlds; as ``ElementWork``."""
-
-    def __init__(self, elements: list[PreciseElements], u: Array, moved: Array):
-        self._elements = elements
-        of_worlds = [each.work(*pair) for each, *pair in zip(elements, u, moved, strict=True)]
-        self._of_mu, self._of_lam, self._of_rest = (np.concatenate(values) for values in zip(*of_worlds, strict=True))
-
-    def of_lame(self) -> tuple[Array, Array]:
-        return self._of_mu, self._of_lam
-
-    def of_rest(self) -> Array:
-        return self._of_rest
-
-    def of_activation(self) -> Array:
-        return np.zeros(0)
-
-    def of_weights(self, densities: Array) -> Array:
-        rows = densities.reshape(len(self._elements), -1, 1, 1) * np.eye(3)
-        return np.concatenate([each.scatter(-row) for each, row in zip(self._elements, rows, strict=True)])

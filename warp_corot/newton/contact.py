@@ -8,28 +8,31 @@ late, and what is deep then is let out slowly.
 
 from __future__ import annotations
 
-from typing import Any
+from functools import partial
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from warp_corot.elasticity.model import Kept
 from warp_corot.errors import InputError
 from warp_corot.kernels.newton import explicit, rows
-from warp_corot.kernels.newton.particles import NO_ROW, UNKNOWN_BEFORE, Bodies, Particles
+from warp_corot.kernels.newton.particles import NO_ROW, UNKNOWN_BEFORE, Bodies, Memory, Particles
 from warp_corot.mesh.topology import boundary_faces, linked, node_pairs
 
-from .library import Step, newton
+from .library import Step, Structs, newton
+
+if TYPE_CHECKING:
+    from .steps import Report
 
 #: ``newton.BodyFlags.KINEMATIC``, for bodies with prescribed motion.
 KINEMATIC = int(newton.BodyFlags.KINEMATIC)
 #: Sine of an angle below which two edges are parallel, as in Newton's detector.
 PARALLEL = 1e-5
-#: The most states whose bodies are remembered.
-STATES = 8
 #: Speed at which what was found too late is pushed out [m/s].
 RECOVERY = 0.25
+#: The fields of the law of contact.
+LAW = ("stiffness", "damping", "slope", "friction", "adhesion", "recovery")
 
 
 class Contacts:
@@ -37,6 +40,7 @@ class Contacts:
 
     Args:
         model: The model.
+        report: Failures of worlds.
         margin: Distance at which soft bodies begin to push one another [m]; None: they do not.
         moves: Whether forces move bodies in a step; else they go on as they are.
 
@@ -47,43 +51,41 @@ class Contacts:
         reactions: Wrenches of the particles on the bodies in the last substep [N, N m], spatial_vector [B].
     """
 
-    def __init__(self, model: newton.Model, margin: float | None = None, *, moves: bool = True):
-        self._fixed = KINEMATIC if moves else int(newton.BodyFlags.ALL)
+    def __init__(self, model: newton.Model, report: Report, margin: float | None = None, *, moves: bool = True):
         self.model, self.device, bodies = model, model.device, model.body_count
+        self._launch = partial(wp.launch, device=self.device)
+        self._report, like = report, model.state()
         #: Contacts of soft bodies with one another, if they have any.
         self.pairs = None if margin is None else SoftPairs(model, margin)
         self.rows = wp.zeros(0, dtype=rows.Row, device=self.device)
         self.contact_count = self.count = 0
         self._lists: explicit.PairLists | None = None
-        #: In how many rows particles and bodies may be in a step; and the same of particles with the pairs that touch.
+        #: In how many rows particles may be in a step; and the same with the pairs that touch.
         self._load = wp.zeros(model.particle_count, dtype=wp.float32, device=self.device)
         self._loads = self._load if self.pairs is None else wp.zeros_like(self._load)
         self._places = wp.zeros(bodies, dtype=wp.float32, device=self.device)
         #: Forces on particles before contact forces [N], which friction uses.
         self._before = wp.empty(model.particle_count, dtype=wp.vec4, device=self.device)
-        self._nothing = wp.empty(0, dtype=wp.float32, device=self.device)
         self._no_wrenches = wp.empty(0, dtype=wp.spatial_vectorf, device=self.device)
         self.reactions = wp.zeros(bodies, dtype=wp.spatial_vectorf, device=self.device)
-        self._bodies: dict[tuple, Bodies] = {}
-        self._particles, self._shapes = _Given(Particles, "particle_", model), _Given(rows.Shapes, "shape_", model)
-        self._attachments = _Given(rows.Attachments, "attachment_particle_body_", model)
-        self._of_bodies = _Given(Bodies, "body_", model)
-        self._records: _Given | None = None
+        fixed = KINEMATIC if moves else int(newton.BodyFlags.ALL)
+        self._particles = Structs(Particles, "particle_", like, model, report)
+        self._bodies = Structs(Bodies, "body_", like, model, report, fixed_flag=fixed, places=self._places)
+        self._shapes = Structs(rows.Shapes, "shape_", model)
+        self._attachments = Structs(rows.Attachments, "attachment_particle_body_", model)
+        self._records: Structs | None = None
         self._no_records, self.law = rows.Records(), rows.ContactLaw()
-        self._law_values: list[float] = []
         self._nearest = wp.empty(0, dtype=wp.int64, device=self.device)
-        #: What particles had in the last step and have in this one, float32 [P]; see ``kernels.newton.rows``.
-        self._before_step, self._in_step = (
-            wp.zeros(model.particle_count, dtype=wp.float32, device=self.device) for _ in range(2)
-        )
+        self._memory, self._no_memory = Memory(), Memory()
+        self._memory.before, self._memory.after = (wp.zeros_like(self._load) for _ in range(2))
         self._last_dt = 0.0
         self.forget()
         self.refresh()
 
     def forget(self) -> None:
         """Forget which particles had contacts: these have jumped, or it was not asked."""
-        self._before_step.fill_(float(UNKNOWN_BEFORE))
-        self._in_step.fill_(float(NO_ROW))
+        self._memory.before.fill_(float(UNKNOWN_BEFORE))
+        self._memory.after.fill_(float(NO_ROW))
 
     def refresh(self) -> None:
         """Check that attachments can be stepped.
@@ -99,48 +101,45 @@ class Contacts:
 
     # --- launches ----------------------------------------------------------------------------------------------------
 
-    def begin(self, step: Step, trouble: wp.array) -> None:
-        """Launch the rows of a step.
+    def particles(self, state: newton.State) -> Particles:
+        """Particles in a state."""
+        return self._particles(state, self.model, self._report)
 
-        Args:
-            step: The step.
-            trouble: Failures of worlds.
-        """
-        model, state, found = self.model, step.state_in, step.contacts
-        touches = found is not None and self._can_touch(found)
+    def bodies(self, state: newton.State) -> Bodies:
+        """Bodies in a state."""
+        return self._bodies(state, self.model, self._report)
+
+    def begin(self, step: Step) -> None:
+        """Launch the rows of a step."""
+        model, found = self.model, step.contacts
+        touches = found is not None and model.shape_count
         self.contact_count = int(found.soft_contact_max) if found is not None and touches else 0
         self.count = self.contact_count + int(model.attachment_particle_body_count)
         self._lists = None if self.pairs is None or found is None else self.pairs.lists_of(found)
         if self._last_dt and not self.contact_count:
             self.forget()
-        eased, self._last_dt = RECOVERY * self._last_dt, step.dt if self.contact_count else 0.0
+        self._memory.eased, self._last_dt = RECOVERY * self._last_dt, step.dt if self.contact_count else 0.0
         if self.count or self._lists is not None:
-            self._take_law()
+            given = [model.soft_contact_ke, model.soft_contact_kd, model.soft_contact_kf, model.soft_contact_mu]
+            for name, value in zip(LAW, [*given, model.particle_adhesion, RECOVERY], strict=True):
+                setattr(self.law, name, value)
             self._load.zero_()
             self._places.zero_()
         if not self.count:
             return
         if len(self.rows) != self.count:
             self.rows = wp.zeros(self.count, dtype=rows.Row, device=self.device)
-        those = self._records_of(found, step) if found is not None and touches else self._no_records
-        inputs = [self.contact_count, self.law, those, self._shapes.of(model), self._attachments.of(model)]
-        inputs += [model.particle_flags, model.particle_radius, state.particle_q, state.body_q]
-        inputs += [eased, self._before_step, self._in_step, self._load, self._places]
-        self._launch(rows.fill_rows, self.count, inputs, [self.rows, trouble])
+        records = self._records_of(found, step) if self.contact_count else self._no_records
+        inputs = [self.contact_count, self.law, records, self._shapes(model), self._attachments(model)]
+        inputs += [self.particles(step.state_in), self.bodies(step.state_in), self._memory, self._load]
+        self._launch(rows.fill_rows, self.count, inputs, [self.rows])
 
     @property
-    def particles(self) -> Particles:
-        """The model's particles."""
-        return self._particles.of(self.model)
-
-    @property
-    def memory(self) -> list[wp.array]:
+    def memory(self) -> Memory:
         """What particles had in the last step and have in this one; empty without contacts."""
-        return [self._before_step, self._in_step] if self.contact_count else [self._nothing, self._nothing]
+        return self._memory if self.contact_count else self._no_memory
 
-    def add_forces(
-        self, substep: Step, of_bodies: newton.State, f: wp.array, trouble: wp.array, share: float = 1.0
-    ) -> None:
+    def add_forces(self, substep: Step, of_bodies: newton.State, f: wp.array, share: float = 1.0) -> None:
         """Add forces on particles to f, vec4 [P], and set ``reactions``.
 
         Args:
@@ -148,60 +147,30 @@ class Contacts:
                 spatial_vector [R + S].
             of_bodies: The state of the bodies.
             f: Forces [N], which already hold all others.
-            trouble: Failures of worlds.
             share: The substep's share of the step, in the mean of ``reported``.
         """
-        model, state, dt, reported = self.model, substep.state_in, substep.dt, substep.reported
+        dt, particles, load = substep.dt, self.particles(substep.state_in), self._load
         if self.contact_count or self._lists is not None:
             wp.copy(self._before, f)
-        bodies, particles = self.bodies(of_bodies), self.particles
-        motion = [state.particle_q, state.particle_qd, self._before]
-        if model.body_count:
+        if self.model.body_count:
             self.reactions.zero_()
-        surfaces = []
-        if self._lists is not None and self.pairs is not None:
-            surfaces = [self.pairs.surfaces, self._lists, self.law]
-            wp.copy(self._loads, self._load)
-            inputs = [*surfaces, state.particle_q]
-            self._launch(explicit.count_pair_loads, self.pairs.size, inputs, [self._loads])
-        load = self._loads if surfaces else self._load
+        pairs, surfaces = self.pairs, []
+        if self._lists is not None and pairs is not None:
+            surfaces, load = [pairs.surfaces, self._lists, self.law], self._loads
+            wp.copy(load, self._load)
+            self._launch(explicit.count_pair_loads, pairs.size, [*surfaces, particles, load])
         if self.count:
-            first = substep.contacts.rigid_contact_max if substep.contacts is not None else 0
-            inputs = [dt, share, self.law, self.contact_count, first, self.rows, load, particles, bodies, *motion]
-            outputs = [f, self.reactions, self._no_wrenches if reported is None else reported]
+            inputs = [dt, share, self.law, self.contact_count, substep.first_contact, self.rows, load, particles]
+            inputs += [self.bodies(of_bodies), self._before]
+            outputs = [f, self.reactions, self._no_wrenches if substep.reported is None else substep.reported]
             self._launch(explicit.scatter_rows, self.count, inputs, outputs)
-        if surfaces and self.pairs is not None:
-            self._launch(
-                explicit.scatter_pairs, self.pairs.size, [*surfaces, dt, load, particles, *motion], [f, trouble]
-            )
+        if surfaces and pairs is not None:
+            self._launch(explicit.scatter_pairs, pairs.size, [*surfaces, dt, load, particles, self._before], [f])
 
-    def bodies(self, of_bodies: newton.State) -> Bodies:
-        """Bodies in a state; made once for each of the states that take turns."""
-        arrays = of_bodies.body_q, of_bodies.body_qd
-        if arrays not in self._bodies:
-            if len(self._bodies) == STATES:
-                self._bodies.clear()
-            self._bodies[arrays] = self._made_bodies(*arrays)
-        return self._bodies[arrays]
-
-    def _take_law(self) -> None:
-        """Take the model's present values."""
-        model = self.model
-        values = [model.soft_contact_ke, model.soft_contact_kd, model.soft_contact_kf, model.soft_contact_mu]
-        values += [model.particle_adhesion, RECOVERY]
-        if values != self._law_values:
-            self._law_values, self.law = values, rows.ContactLaw()
-            names: Any = rows.ContactLaw
-            for name, value in zip(names.vars, values, strict=True):
-                setattr(self.law, name, value)
-
-    def _can_touch(self, contacts: newton.Contacts) -> bool:
-        return bool(contacts.soft_contact_max and self.model.shape_count)
-
-    def _records_of(self, contacts: newton.Contacts, step: Step) -> rows.Records:
+    def _records_of(self, contacts: newton.Contacts | None, step: Step) -> rows.Records:
         if self._records is None:
-            self._records = _Given(rows.Records, "soft_contact_", contacts)
-        made = self._records.of(contacts)
+            self._records = Structs(rows.Records, "soft_contact_", contacts)
+        made = self._records(contacts)
         # These attributes are private to Newton; without features there are no records of meshes.
         features = getattr(contacts, "_soft_contact_mesh_features", None)
         data = getattr(contacts, "_soft_contact_mesh_data", None)
@@ -215,45 +184,9 @@ class Contacts:
         if made.nearest is not self._nearest:
             made.nearest = self._nearest
         self._nearest.fill_(int(rows.FAR))
-        inputs = [self._shapes.of(self.model), step.state_in.particle_q, step.state_in.body_q, made]
-        self._launch(rows.find_nearest, self.contact_count, inputs, [])
+        inputs = [self._shapes(self.model), step.state_in.particle_q, self.bodies(step.state_in), made]
+        self._launch(rows.find_nearest, self.contact_count, inputs)
         return made
-
-    def _made_bodies(self, q: wp.array | None, qd: wp.array | None) -> Bodies:
-        made = self._of_bodies.new(self.model)
-        made.fixed_flag, made.places = self._fixed, self._places
-        if self.model.body_count:
-            made.q, made.qd = q, qd
-        return made
-
-    def _launch(self, kernel: wp.Kernel, dim: int, inputs: list, outputs: list) -> None:
-        wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)
-
-
-class _Given(Kept[Any]):
-    """A struct of arrays of a model or of contacts, made again where these have others.
-
-    Args:
-        struct: The struct, whose fields have Newton's names without the prefix; those that Newton lacks stay empty.
-        prefix: The prefix.
-        owner: The model, or contacts.
-    """
-
-    def __init__(self, struct: Any, prefix: str, owner: Any):
-        names = [(field, name) for field in struct.vars for name in (prefix + field, field) if hasattr(owner, name)]
-        self._names = {field: name for field, name in reversed(names)}
-        super().__init__(struct, *self._names)
-
-    def of(self, owner: Any) -> Any:
-        return self(*self._arrays(owner))
-
-    def new(self, owner: Any) -> Any:
-        """Another one."""
-        return self.made(*self._arrays(owner))
-
-    def _arrays(self, owner: Any) -> list[wp.array | None]:
-        found = (getattr(owner, name) for name in self._names.values())
-        return [value if isinstance(value, wp.array) else None for value in found]
 
 
 class SoftPairs:
@@ -275,7 +208,7 @@ class SoftPairs:
                 "add_forest and add_mesh surface=True"
             )
         self.margin, self.device = margin, model.device
-        self._lists: _Given | None = None
+        self._lists: Structs | None = None
         self.size = max(model.particle_count, model.edge_count)
         triangles = model.tri_indices.numpy().reshape(-1, 3)
         edges = model.edge_indices.numpy().reshape(-1, 4)
@@ -301,10 +234,8 @@ class SoftPairs:
                 "pipeline.collide(state, contacts, soft_self_contact=True)"
             )
         if self._lists is None:
-            self._lists = _Given(explicit.PairLists, "", data)
-        lists = self._lists.of(data)
-        lists.margin, lists.parallel = self.margin, PARALLEL
-        return lists
+            self._lists = Structs(explicit.PairLists, "", data, margin=self.margin, parallel=PARALLEL)
+        return self._lists(data)
 
     def _on_device(self, values: npt.NDArray[Any], dtype: type) -> wp.array:
         return wp.array(values, dtype=dtype, device=self.device)

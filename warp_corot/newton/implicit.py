@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 from types import SimpleNamespace
 from typing import Any
 
@@ -29,7 +30,6 @@ from warp_corot.solvers.recorded import Replays
 
 from .contact import Contacts
 from .library import Step, newton
-from .others import Others
 from .steps import Steps
 from .tetrahedra import Tetrahedra
 
@@ -44,51 +44,35 @@ RIGID_STEP = 5e-4
 PADDING = 2
 
 
-class Unknowns:
-    """Entries of vectors: one for each particle, two for each body, world after world.
+def unknowns_of(model: newton.Model) -> tuple[int, kernels.Unknowns]:
+    """The entries of vectors, without a right side and motions, and in how many worlds they are solved for side by
+    side.
 
     Each world is solved by itself if everything that moves is in a world; otherwise all worlds are solved together.
-
-    Args:
-        model: The model.
-
-    Attributes:
-        worlds: Number of worlds that are solved side by side.
-        count: Number of entries of each.
-        particle, body: Entries of particles, and of bodies' translations, int32 [P], [B].
-        owner: The body of an entry, or -1, int32 [worlds * count].
-        mass: Inertia of each entry [kg/s^2], zero if it is not free, float32 [worlds * count].
-        roots: The matrix from each body's entry to its rotation, mat33 [B].
     """
-
-    def __init__(self, model: newton.Model):
-        particles, bodies = model.particle_count, model.body_count
-        worlds = model.particle_world.numpy()
-        if bodies:
-            worlds = np.concatenate([worlds, np.repeat(model.body_world.numpy(), 2)])
-        if worlds.min() < 0:
-            worlds = np.zeros_like(worlds)
-        worlds, size = np.unique(worlds, return_inverse=True, return_counts=True)[1:]
-        if len(size) * size.max() > PADDING * size.sum():
-            worlds, size = np.zeros_like(worlds), np.array([len(worlds)])
-        self.worlds, self.count = len(size), int(size.max())
-        entry = np.empty(len(worlds), np.int32)
-        in_order = np.argsort(worlds, kind="stable")
-        entry[in_order] = np.arange(len(worlds)) + np.repeat(
-            self.count * np.arange(len(size)) - np.cumsum(size) + size, size
-        )
-        owner = np.full(self.worlds * self.count, -1, np.int32)
-        owner[entry[particles::2]] = np.arange(bodies)
-        self.particle, self.body, self.owner = (
-            wp.array(values, dtype=wp.int32, device=model.device)
-            for values in (entry[:particles], np.ascontiguousarray(entry[particles::2]), owner)
-        )
-        self.mass = wp.zeros(len(owner), dtype=wp.float32, device=model.device)
-        self.roots = wp.zeros(bodies, dtype=wp.mat33, device=model.device)
-
-    def zeros(self, dtype: type = wp.vec4) -> wp.array:
-        """Zero in each entry."""
-        return wp.zeros(len(self.mass), dtype=dtype, device=self.mass.device)
+    particles, bodies, made = model.particle_count, model.body_count, kernels.Unknowns()
+    worlds = model.particle_world.numpy()
+    if bodies:
+        worlds = np.concatenate([worlds, np.repeat(model.body_world.numpy(), 2)])
+    if worlds.min() < 0:
+        worlds = np.zeros_like(worlds)
+    worlds, size = np.unique(worlds, return_inverse=True, return_counts=True)[1:]
+    if len(size) * size.max() > PADDING * size.sum():
+        worlds, size = np.zeros_like(worlds), np.array([len(worlds)])
+    made.count = count = int(size.max())
+    entry = np.empty(len(worlds), np.int32)
+    starts = count * np.arange(len(size)) - np.cumsum(size) + size
+    entry[np.argsort(worlds, kind="stable")] = np.arange(len(worlds)) + np.repeat(starts, size)
+    owner = np.full(len(size) * count, -1, np.int32)
+    owner[entry[particles::2]] = np.arange(bodies)
+    made.particle, made.body, made.owner = (
+        wp.array(values, dtype=wp.int32, device=model.device)
+        for values in (entry[:particles], np.ascontiguousarray(entry[particles::2]), owner)
+    )
+    made.mass = wp.zeros(len(owner), dtype=wp.float32, device=model.device)
+    made.roots = wp.zeros(bodies, dtype=wp.mat33, device=model.device)
+    made.way, made.fall = (wp.zeros(len(owner), dtype=wp.vec4, device=model.device) for _ in range(2))
+    return len(size), made
 
 
 class TurnedPieces:
@@ -103,11 +87,10 @@ class TurnedPieces:
 
     Attributes:
         positions: Those of the turned particles [m], vec3 [P].
-        way: The way to them [m], vec4 [entries].
     """
 
-    def __init__(self, model: newton.Model, tetrahedra: Tetrahedra, unknowns: Unknowns):
-        self._tetrahedra, self._entry, device = tetrahedra, unknowns.particle, model.device
+    def __init__(self, model: newton.Model, tetrahedra: Tetrahedra, unknowns: kernels.Unknowns):
+        self._tetrahedra, self._unknowns, device = tetrahedra, unknowns, model.device
         piece = np.full(model.particle_count, -1, np.int32)
         piece[tetrahedra.tets] = connected(tetrahedra.tets)[:, None]
         members = np.argsort(piece, kind="stable")[np.count_nonzero(piece < 0) :]
@@ -122,17 +105,15 @@ class TurnedPieces:
         self._turns = wp.zeros(count, dtype=wp.mat33, device=device)
         self._any_turns = wp.zeros(1, dtype=wp.int32, device=device)
         self.positions = wp.zeros(model.particle_count, dtype=wp.vec3, device=device)
-        self.way = unknowns.zeros()
 
-    def launch(self, state: newton.State, particles: Particles, dt: float) -> None:
-        """Launch the turn in a step of dt [s]; the elements' gathered positions are turned, too."""
-        tets, sums, q = self._tetrahedra, self._sums, state.particle_q
-        sums.launch(kernels.sum_motion, [self._first, self._members, particles, q, state.particle_qd])
+    def launch(self, particles: Particles, dt: float) -> None:
+        """Launch the turn in a step of dt [s], and the way there; the elements' gathered positions are turned, too."""
+        sums = self._sums
+        sums.launch(kernels.sum_motion, [self._first, self._members, particles])
         outputs = [self._centres, self._turns, self._any_turns]
         sums.launch_scalars(increments.find_turns, [wp.float64(dt)], outputs)
-        inputs = [self._piece, q, self._centres, self._turns, self._entry]
-        outputs = [tets.u, self.positions, self.way]
-        wp.launch(kernels.turn_particles, len(self.positions), inputs, outputs, device=sums.device)
+        inputs = [self._piece, self._centres, self._turns, particles, self._unknowns, self._tetrahedra.u]
+        wp.launch(kernels.turn_particles, len(self.positions), inputs, [self.positions], device=sums.device)
 
 
 class RowForces:
@@ -146,7 +127,7 @@ class RowForces:
         solves: Number of linear solves of the last step, int32 [1].
     """
 
-    def __init__(self, contacts: Contacts, unknowns: Unknowns):
+    def __init__(self, contacts: Contacts, unknowns: kernels.Unknowns):
         self.device, self._contacts, self._unknowns = contacts.device, contacts, unknowns
         empty = (wp.spatial_vector, wp.vec4)
         self._no_wrenches, self._no_motion = (wp.empty(0, dtype=dtype, device=self.device) for dtype in empty)
@@ -160,26 +141,24 @@ class RowForces:
 
     def begin(self, step: Step, of_bodies: newton.State) -> bool:
         """Launch the rows of a step from its first state; return whether their arrays are new."""
-        contacts, state, is_new = self._contacts, step.state_in, self.count != len(self._rows.nodes)
-        self._law = [step.dt, contacts.law.adhesion]
+        contacts, is_new = self._contacts, self.count != len(self._rows.nodes)
         if is_new:
             self._make_room()
-        inputs = [step.dt, contacts.law, contacts.rows, state.particle_q]
-        inputs += [contacts.bodies(of_bodies), self._unknowns.particle, self._unknowns.body, self._unknowns.roots]
-        self._launch(kernels.begin_springs, inputs, [self._rows])
+        self._rows.dt, self._rows.adhesion = step.dt, contacts.law.adhesion
+        given = [contacts.law, contacts.particles(step.state_in), contacts.bodies(of_bodies), self._unknowns]
+        self._launch(kernels.begin_springs, *given, contacts.rows, self._rows)
         return is_new
 
     def report(self, step: Step, share: float) -> None:
         """Launch the wrenches on bodies [N, N m], and add those of contacts, times ``share``, to the reported ones."""
         contacts = self._contacts
         contacts.reactions.zero_()
-        first = 0 if step.contacts is None else step.contacts.rigid_contact_max
-        inputs = [self._rows, contacts.contact_count, self._unknowns.owner, share, first]
         reported = self._no_wrenches if step.reported is None else step.reported
-        self._launch(kernels.report_rows, inputs, [contacts.reactions, reported])
+        given = [self._rows, self._unknowns, contacts.contact_count, share, step.first_contact]
+        self._launch(kernels.report_rows, *given, contacts.reactions, reported)
 
     def add_blocks(self, blocks: wp.array) -> None:
-        self._launch(kernels.add_row_blocks, [self._rows], [blocks])
+        self._launch(kernels.add_row_blocks, self._rows, blocks)
 
     # --- as a contact of solves, see ``SolvedContact`` ---------------------------------------------------------------
 
@@ -187,13 +166,13 @@ class RowForces:
         pass
 
     def update(self, d: wp.array, *, is_solved: bool = False) -> None:
-        self._launch(kernels.update_springs, [*self._law, int(is_solved), d], [self._rows])
+        self._launch(kernels.update_springs, int(is_solved), d, self._rows)
 
     def add_forces(self, y: wp.array) -> None:
-        self._launch(kernels.add_row_forces, [self._rows, self._no_motion], [y])
+        self.add_products(self._no_motion, y)
 
     def add_products(self, x: wp.array, y: wp.array) -> None:
-        self._launch(kernels.add_row_forces, [self._rows, x], [y])
+        self._launch(kernels.add_row_forces, self._unknowns, self._rows, x, y)
 
     def update_springs(self) -> None:
         pass
@@ -204,8 +183,7 @@ class RowForces:
     def add_slopes(
         self, d: wp.array, change: wp.array, search: wp.array, slopes: wp.array, *, apart: int | None = None
     ) -> None:
-        inputs = [*self._law, self._rows, self._unknowns.count, d, change, search]
-        self._launch(kernels.add_row_slopes, inputs, [slopes])
+        self._launch(kernels.add_row_slopes, self._unknowns, self._rows, d, change, search, slopes)
 
     def launch_going(self, d: wp.array, rounds: wp.array, most: int, going: wp.array) -> None:
         wp.copy(self.solves, rounds)
@@ -217,15 +195,15 @@ class RowForces:
 
     def _make_room(self) -> None:
         self._rows = made = kernels.RowSprings()
-        made.mass, made.solves = self._unknowns.mass, self.solves
+        made.solves = self.solves
         fields: Any = kernels.RowSprings
         for name, variable in fields.vars.items():
-            if name not in ("mass", "solves"):
+            if name not in ("dt", "adhesion", "solves"):
                 setattr(made, name, wp.zeros(self.count, dtype=variable.type.dtype, device=self.device))
 
-    def _launch(self, kernel: wp.Kernel, inputs: list, outputs: list) -> None:
+    def _launch(self, kernel: wp.Kernel, *arguments: Any) -> None:
         if self.count:
-            wp.launch(kernel, dim=self.count, inputs=inputs, outputs=outputs, device=self.device)
+            wp.launch(kernel, self.count, arguments, device=self.device)
 
 
 class StepOperator:
@@ -236,18 +214,23 @@ class StepOperator:
     Args:
         model: The model.
         tetrahedra: Its elements.
-        unknowns: The entries of vectors.
+        worlds, unknowns: Number of worlds, and the entries of vectors.
         rows: Contacts and attachments, which are part of the blocks on the diagonal.
 
     Attributes:
         inverse_mass: Positive if an entry is free, float32 [entries].
     """
 
-    def __init__(self, model: newton.Model, tetrahedra: Tetrahedra, unknowns: Unknowns, rows: RowForces):
-        self.device, self.worlds, self.node_count = model.device, unknowns.worlds, unknowns.count
+    def __init__(
+        self, model: newton.Model, tetrahedra: Tetrahedra, worlds: int, unknowns: kernels.Unknowns, rows: RowForces
+    ):
+        self.device, self.worlds, self.node_count = model.device, worlds, unknowns.count
+        self._launch = partial(wp.launch, device=self.device)
         self._tetrahedra, self._rows, self._count = tetrahedra, rows, int(model.tet_count)
         self.inverse_mass = unknowns.mass
-        self._of_elements, self._blocks = (unknowns.zeros(wp.mat33) for _ in range(2))
+        self._of_elements, self._blocks = (
+            wp.zeros(len(unknowns.mass), dtype=wp.mat33, device=self.device) for _ in range(2)
+        )
         scales = wp.array([1.0, 0.0, 1.0], dtype=wp.float32, device=self.device)
         self._masses = [scales, unknowns.mass, unknowns.mass]
         self._none, self._no_list = (wp.zeros(0, dtype=dtype, device=self.device) for dtype in (wp.vec4, wp.int32))
@@ -297,9 +280,6 @@ class StepOperator:
         kernel = add_stiffness_product(GeneralElements, kernels.Linearised, kernels.linearised)
         self._launch(kernel, self._count, [self._elements, self._made, self._none, x], [y])
 
-    def _launch(self, kernel: wp.Kernel, dim: int, inputs: list, outputs: list) -> None:
-        wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)
-
 
 class RowBlocks(BlockDiagonal):
     """The inverses of the blocks on the diagonal of a step's matrix, with those of the rows that act."""
@@ -316,34 +296,32 @@ class ImplicitSteps(Steps):
     only soft bodies, gravity and forces in the state act on rigid bodies; their own solver then moves them.
 
     Args:
-        model: The model.
-        tetrahedra, contacts, others: The parts of the model.
-        damping: Rate of mass-proportional damping [1/s].
+        model, parts: As for ``Steps``.
 
     Raises:
         InputError: The model has something that only explicit steps support.
     """
 
-    def __init__(self, model: newton.Model, tetrahedra: Tetrahedra, contacts: Contacts, others: Others, damping: float):
-        super().__init__(model, tetrahedra, contacts, others, damping)
-        if others.has_particles:
+    def __init__(self, model: newton.Model, *parts: Any):
+        super().__init__(model, *parts)
+        if self.others.has_particles:
             raise InputError(
                 "the model has springs, cloth or bending edges with stiffness, or particle_contact is given; "
                 "integrator='implicit' steps only tetrahedra: use integrator='explicit'"
             )
-        self._unknowns = unknowns = Unknowns(model)
-        self._rows = RowForces(contacts, unknowns)
-        self._turned = TurnedPieces(model, tetrahedra, unknowns)
-        self._operator = StepOperator(model, tetrahedra, unknowns, self._rows)
-        operator: Any = self._operator
+        worlds, self._unknowns = unknowns_of(model)
+        self._rows = RowForces(self.contacts, self._unknowns)
+        self._turned = TurnedPieces(model, self.tetrahedra, self._unknowns)
+        operator: Any = StepOperator(model, self.tetrahedra, worlds, self._unknowns, self._rows)
         contact: Any = self._rows
+        self._operator = operator
         self._system = BlockSystem([operator], [RowBlocks(operator)], contact=contact, most=ITERATIONS)
         self._system.solver.tolerance.fill_(TOLERANCE)
+        self._unknowns.b, self._unknowns.d = self._system.b, self._system.x
         self._solve = ContactSolve(self._system, [])
-        self._motions = [unknowns.particle, self._system.x]
-        self._fall = unknowns.zeros()
+        self._motions = [self._unknowns.particle, self._system.x]
         #: Number of linear solves, which is that of all worlds.
-        self._rounds = wp.zeros(unknowns.worlds, dtype=wp.int32, device=self.device)
+        self._rounds = wp.zeros(worlds, dtype=wp.int32, device=self.device)
         # Viscous forces are those of the velocities after the step, which the solve finds.
         still = wp.zeros(model.particle_count, dtype=wp.vec3, device=self.device)
         self._turned_state: Any = SimpleNamespace(particle_q=self._turned.positions, particle_qd=still)
@@ -351,44 +329,37 @@ class ImplicitSteps(Steps):
         self._can_replay = False
 
     def _launch_forces(self, substep: Step, given: newton.State, share: float, done: float) -> None:
-        self._turned.launch(substep.state_in, self.contacts.particles, substep.dt)
+        dt, contacts, of_bodies = substep.dt, self.contacts, self._bodies_after(done, substep, given)
+        particles, system, unknowns = contacts.particles(substep.state_in), self._system, self._unknowns
+        self._turned.launch(particles, dt)
         self.tetrahedra.add_forces(self._turned_state, self._activation, self._f)
-        of_bodies = self._bodies_after(done, substep, given)
-        self._launch_unknowns(substep, of_bodies, given)
+        self._operator.take(self._turned.positions, dt)
+        system.b.zero_()
+        self._operator.add_product(unknowns.way, system.b)
+        inputs = [dt, self.damping, particles, self._f, unknowns]
+        self._launch(kernels.begin_particles, self.model.particle_count, inputs)
+        if self.model.body_count:
+            inputs = [dt, contacts.bodies(of_bodies), given.body_f, int(self.others.has_bodies), unknowns]
+            self._launch(kernels.begin_bodies, self.model.body_count, inputs)
         if self._rows.begin(substep, of_bodies):
             self._replays.forget()
-        self._replays.launch((substep.dt, self.contacts.law.adhesion), self._launch_solve)
+        self._replays.launch((dt, contacts.law.adhesion), self._launch_solve)
         self._rows.report(substep, share)
         self._launch_reactions(given, share)
 
-    def _launch_unknowns(self, substep: Step, of_bodies: newton.State, given: newton.State) -> None:
-        """Launch the linearisation, the right side, the inertia, the first motions, and how gravity changes these."""
-        model, now, dt, system, operator = self.model, substep.state_in, substep.dt, self._system, self._operator
-        operator.take(self._turned.positions, dt)
-        system.b.zero_()
-        operator.add_product(self._turned.way, system.b)
-        unknowns, trouble = self._unknowns, self.report.trouble
-        outputs = [system.b, unknowns.mass, system.x, self._fall]
-        inputs = [dt, self.damping, self.contacts.particles, self._f, now.particle_qd, trouble, unknowns.particle]
-        self._launch(kernels.begin_particles, model.particle_count, inputs, outputs)
-        if model.body_count:
-            inputs = [dt, self.contacts.bodies(of_bodies), model.gravity, given.body_f, int(self.others.has_bodies)]
-            inputs += [trouble, unknowns.body]
-            self._launch(kernels.begin_bodies, model.body_count, inputs, [*outputs, unknowns.roots])
-
     def _launch_solve(self) -> None:
         """Launch the solve for the motions, with contact until the right ones act."""
-        system, rows, solve = self._system, self._rows, self._solve
+        system, rows, solve, fall = self._system, self._rows, self._solve, self._unknowns.fall
         self._operator.take_diagonal()
         linear, status = solve.iterations, system.solver.status
         if rows.count:
             rows.update(system.x, is_solved=True)
-            solve.launch(self._fall)
+            solve.launch(fall)
             rows.launch_end(system.x)
             wp.copy(self._rounds, rows.solves, count=1)
         else:
             system.update()
-            self._launch(add_vectors, len(system.x), [self._fall], [system.x])
+            self._launch(add_vectors, len(system.x), [fall], [system.x])
             system.solve(guessed=True)
             linear = system.solver.iterations
             self._rounds.fill_(1)

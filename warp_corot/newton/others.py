@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
@@ -18,7 +18,7 @@ import numpy.typing as npt
 import warp as wp
 
 from warp_corot.errors import InputError
-from warp_corot.kernels.newton.particles import scatter_blocks
+from warp_corot.kernels.implicit.tangent import add_products
 
 from .library import ModelView, SolverBase, SolverSemiImplicit, Step, newton
 
@@ -105,20 +105,19 @@ class Others:
             sizes = (*ids.shape, 3, ids.shape[1], 3)
             both = [np.einsum("esi,est,etj->eij", strain, m, strain).reshape(sizes) for m in (stiffness, damping)]
             blocks.append(np.stack(both, axis=1).transpose(0, 2, 4, 1, 3, 5).reshape(-1, 2, 3, 3))
-        self._pairs = wp.array(np.concatenate(nodes), dtype=wp.vec2i, device=self.device)
-        found = np.concatenate(blocks)
-        self._stiffness, self._damping = (
-            wp.array(np.ascontiguousarray(found[:, k]), dtype=wp.mat33, device=self.device) for k in range(2)
-        )
-        self.damped = bool(found[:, 1].any())
+        self._blocks = np.concatenate(blocks)
+        self._pairs = [wp.array(ids, dtype=wp.int32, device=self.device) for ids in np.concatenate(nodes).T]
+        self.damped = bool(self._blocks[:, 1].any())
 
-    def add_linear_forces(self, a: float, b: float, u: wp.array, f: wp.array) -> None:
-        """Add -(a K + b C) u, with stiffness K and damping C about the model's positions, to f, both vec4 [P].
+    def linear_forces(self, a: float, b: float) -> Callable[[wp.array, wp.array], None]:
+        """A function that adds -(a K + b C) u, with stiffness K and damping C about the model's positions, to f, both
+        vec4 [P].
 
         Contact between particles is not included.
         """
-        inputs = [self._pairs, self._stiffness, self._damping, a, b, u]
-        wp.launch(scatter_blocks, len(self._pairs), inputs, [f], device=self.device)
+        found = -(a * self._blocks[:, 0] + b * self._blocks[:, 1])
+        inputs = [*self._pairs, wp.array(found, dtype=wp.mat33, device=self.device)]
+        return lambda u, f: wp.launch(add_products, len(found), [*inputs, u], [f], device=self.device)
 
     def _elements(self) -> Iterator[Elements]:
         model = self.model

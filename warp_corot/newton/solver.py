@@ -19,8 +19,8 @@ from .implicit import ImplicitSteps
 from .library import CouplingInterface, ModelView, SolverBase, Step, newton
 from .others import Others
 from .scene import STATE, attribute_of, register_custom_attributes
-from .steps import Recordings, Steps
-from .substeps import SAFETY, Following, check_substep, stable_steps
+from .steps import Recordings, Report, Steps
+from .substeps import SAFETY, Following, stable_steps
 from .tetrahedra import LAME, Tetrahedra
 
 #: Factor by which a recorded substep may exceed the safe one; below the smallest margin of the safe substep.
@@ -120,25 +120,16 @@ class SolverCorotated(SolverBase, CouplingInterface):
         stable_dt: float | None = None,
         cuts: None = None,
     ):
-        _check_options(
-            model,
-            lame=lame,
-            damping=damping,
-            integrator=integrator,
-            substeps=substeps,
-            stable_dt=stable_dt,
-            self_contact_margin=self_contact_margin,
-            cuts=cuts,
-        )
+        _check_options(model, lame, damping, integrator, substeps, stable_dt, self_contact_margin, cuts)
         super().__init__(model)
         self._substeps = None if substeps is None else int(substeps)
         self._given_stable_dt = stable_dt
         self.tetrahedra = Tetrahedra(model, lame, rotation_level)
         self._others = Others(model, rigid_solver, particle_contact)
-        self._contacts = Contacts(model, self_contact_margin, moves=self._others.has_bodies)
-        self._recordings = Recordings(self.device)
+        self._report, self._recordings = Report(model), Recordings(self.device)
+        self._contacts = Contacts(model, self._report, self_contact_margin, moves=self._others.has_bodies)
         self._is_implicit = integrator == "implicit"
-        parts = (model, self.tetrahedra, self._contacts, self._others, damping)
+        parts = (model, self.tetrahedra, self._contacts, self._others, self._report, damping)
         self._steps = ImplicitSteps(*parts) if self._is_implicit else Steps(*parts)
         follows = substeps is None and not self._is_implicit
         self._following = Following(model, self.tetrahedra) if follows else None
@@ -246,7 +237,7 @@ class SolverCorotated(SolverBase, CouplingInterface):
         reported = None if observables is None else observables.contact_f
         step, following = Step(state_in, state_out, control, contacts, dt, reported), self._following
         _check_step(step, self.model)
-        self._steps.report.check_earlier(following)
+        self._report.check_earlier(following)
         count = self._count_for(dt)
         self._steps.launch(step, count, following)
         self._recordings.follow(state_in, state_out)
@@ -275,7 +266,7 @@ class SolverCorotated(SolverBase, CouplingInterface):
                 stacklevel=2,
             )
         self._recordings.check()
-        self._steps.report.check(self.stable_dt, self._following)
+        self._report.check(self.stable_dt, self._following)
         if self._following is not None and self._following.was_recorded:
             self._following.recover()
 
@@ -357,19 +348,22 @@ class SolverCorotated(SolverBase, CouplingInterface):
             self._following.find_rest(self.contact_dt)
 
     def _count_for(self, dt: float) -> int:
+        """Number of substeps of a step of dt [s]."""
         if isinstance(dt, bool) or not 0.0 < checked_number(dt, "dt", "s") < math.inf:
             raise InputError(f"dt is {dt!r}; it must be a positive number of seconds")
-        dt = float(dt)
+        dt, count = float(dt), self._substeps or 1
         if self._following is not None:
             count = self._following.count_for(dt)
             if count > MOST_SUBSTEPS:
                 substeps = f"{count:.2g} substeps of {dt / count:.3g} s"
                 raise InputError(f"dt is {dt:g} s, which takes {substeps}; take a step of less time")
-            return count
-        count = self._substeps or 1
-        if self._is_implicit:
-            return count
-        check_substep(dt, count, self.stable_dt, self.contact_dt)
+        elif not self._is_implicit and dt / count > self.stable_dt:
+            each = f", {count} substeps of {dt / count:.3g} s" if count > 1 else ""
+            needed = math.ceil(dt / (SAFETY * self.contact_dt))
+            raise InputError(
+                f"dt is {dt:.3g} s{each}; the largest stable step is about {self.stable_dt:.3g} s: "
+                f"make shorter steps, or SolverCorotated(..., substeps={needed}), or substeps=None"
+            )
         return count
 
 
@@ -377,21 +371,9 @@ class SolverCorotated(SolverBase, CouplingInterface):
 
 
 def _check_options(
-    model: Any,
-    *,
-    lame: Any,
-    damping: Any,
-    integrator: Any,
-    substeps: Any,
-    stable_dt: Any,
-    self_contact_margin: Any,
-    cuts: Any,
+    model: Any, lame: Any, damping: Any, integrator: Any, substeps: Any, stable_dt: Any, margin: Any, cuts: Any
 ) -> None:
-    """Check the options of ``SolverCorotated``.
-
-    Raises:
-        InputError: One is out of its range.
-    """
+    """Check the options of ``SolverCorotated``."""
     if not isinstance(model, newton.Model | ModelView):
         raise InputError(f"model is {_named(model)}; it must be a newton.Model, the result of builder.finalize()")
     if cuts is not None:
@@ -407,10 +389,10 @@ def _check_options(
         checked_count(substeps, "substeps", 1)
     if stable_dt is not None and not checked_number(stable_dt, "stable_dt", "s") > 0.0:
         raise InputError(f"stable_dt is {stable_dt!r}; it must be a positive number of seconds or None")
-    if self_contact_margin is None:
+    if margin is None:
         return
-    if not 0.0 < checked_number(self_contact_margin, "self_contact_margin", "m") < math.inf:
-        raise InputError(f"self_contact_margin is {self_contact_margin!r}; it must be a positive distance in m or None")
+    if not 0.0 < checked_number(margin, "self_contact_margin", "m") < math.inf:
+        raise InputError(f"self_contact_margin is {margin!r}; it must be a positive distance in m or None")
     if integrator == "implicit":
         raise InputError(
             "self_contact_margin is given, and integrator is 'implicit', in whose steps soft bodies do not touch one "
@@ -419,15 +401,7 @@ def _check_options(
 
 
 def _check_step(step: Step, model: newton.Model) -> None:
-    """Check the arguments of ``SolverCorotated.step`` except dt.
-
-    Args:
-        step: The arguments.
-        model: The model.
-
-    Raises:
-        InputError: An argument belongs to another model, or is on another device.
-    """
+    """Check that the arguments of ``SolverCorotated.step`` except dt belong to the model and are on its device."""
     found, control, contacts = [], step.control, step.contacts
     for name, state in (("state_in", step.state_in), ("state_out", step.state_out)):
         if getattr(state, "particle_q", model) is model:
@@ -437,8 +411,9 @@ def _check_step(step: Step, model: newton.Model) -> None:
     if control is not None:
         found.append(("control", control.tet_activations, "tet_activations", model.tet_count))
     for name, array, what, count in found:
-        if (0 if array is None else len(array)) != count and (array is not None or what == "particles"):
-            raise InputError(f"{name} has {0 if array is None else len(array)} {what}; the model has {count}")
+        has = 0 if array is None else len(array)
+        if has != count and (array is not None or what == "particles"):
+            raise InputError(f"{name} has {has} {what}; the model has {count}")
         if getattr(array, "device", model.device) != model.device:
             raise InputError(f"{name} is on {array.device}; the model is on {model.device}")
     if contacts is not None and contacts.soft_contact_max and contacts.soft_contact_count.device != model.device:
@@ -446,11 +421,7 @@ def _check_step(step: Step, model: newton.Model) -> None:
 
 
 def _checked_mask(world_mask: Any, model: newton.Model) -> wp.array:
-    """A mask of worlds, bool [world_count + 1].
-
-    Raises:
-        InputError: It is not such an array, or is on another device.
-    """
+    """A mask of worlds, bool [world_count + 1], on the model's device."""
     shape = (model.world_count + 1,)
     fits = isinstance(world_mask, wp.array) and world_mask.dtype == wp.bool and world_mask.shape == shape
     if not fits or world_mask.device != model.device:

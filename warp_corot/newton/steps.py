@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from functools import partial
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -24,9 +25,10 @@ from .tetrahedra import Tetrahedra
 RUNAWAY = float(kernels.RUNAWAY)
 #: Fewer substeps are not recorded, since recording one takes as long as several.
 FEW = 32
-#: Kernels over the states of particles and of bodies.
-FINISH_PARTICLES, RESET_PARTICLES = kernels.state_kernels(wp.vec3, wp.vec3)
-FINISH_BODIES, RESET_BODIES = kernels.state_kernels(wp.transform, wp.spatial_vector)
+#: The flags of the arrays of a state.
+FLAGS = {
+    name: int(getattr(newton.StateFlags, name.upper())) for name in ("particle_q", "particle_qd", "body_q", "body_qd")
+}
 #: What there is no room for, and what to do.
 _NO_ROOM = {
     int(kernels.TOO_MANY_PAIRS): "pairs of soft bodies than Newton has room for: call pipeline.init_soft_self_contact "
@@ -42,36 +44,40 @@ class Steps:
     Args:
         model: The model.
         tetrahedra, contacts, others: The parts of the model.
+        report: Failures of worlds.
         damping: Rate of mass-proportional damping [1/s].
 
     Attributes:
-        report: Failures of worlds.
         totals: The cost of implicit steps: steps, linear solves, iterations of these, and steps with a solve that did
             not converge, int64 [4].
     """
 
-    def __init__(self, model: newton.Model, tetrahedra: Tetrahedra, contacts: Contacts, others: Others, damping: float):
+    def __init__(
+        self,
+        model: newton.Model,
+        tetrahedra: Tetrahedra,
+        contacts: Contacts,
+        others: Others,
+        report: Report,
+        damping: float,
+    ):
         self.model, self.tetrahedra, self.contacts, self.others = model, tetrahedra, contacts, others
-        self.damping = damping
-        self.device = model.device
+        self.report, self.damping, self.device = report, damping, model.device
+        self._launch = partial(wp.launch, device=self.device)
         self._flushed = FlushedSubnormals(self.device)
         #: Bodies that others move go on in each substep, and other solvers may allocate memory.
         self._can_replay = not others.has_particles and not model.body_count
-        p, b = model.particle_count, model.body_count
-        self._f = wp.zeros(p, dtype=wp.vec4, device=self.device)
-        self.report = Report(model)
+        self._f = self._empty(wp.vec4, model.particle_count)
         self.totals = wp.zeros(4, dtype=wp.int64, device=self.device)
-        types = (wp.vec3, wp.vec3)
-        self._particles_before = [wp.empty(p, dtype=dtype, device=self.device) for dtype in types]
-        self._nothing = [wp.empty(0, dtype=dtype, device=self.device) for dtype in types]
+        self._particles_before = [self._empty(wp.vec3, model.particle_count) for _ in range(2)]
+        self._nothing = [self._empty(wp.vec3) for _ in range(2)]
+        self._no_memory = kernels.Memory()
         #: Where particles' motions are and what they are, if they are solved for.
-        self._motions = [wp.empty(0, dtype=dtype, device=self.device) for dtype in (wp.int32, wp.vec4)]
-        self._no_numbers = wp.empty(0, dtype=wp.float32, device=self.device)
-        self._body_f = wp.empty(b, dtype=wp.spatial_vector, device=self.device)
-        of_bodies = (wp.transform, wp.spatial_vector)
-        self._moved = SimpleNamespace(body_q=wp.empty(b, dtype=wp.transform, device=self.device), body_qd=None)
+        self._motions = [self._empty(wp.int32), self._empty(wp.vec4)]
+        self._body_f = self._empty(wp.spatial_vector, model.body_count)
+        self._moved = SimpleNamespace(body_q=self._empty(wp.transform, model.body_count), body_qd=None)
         #: Bodies within a step: their solver never overwrites those before it.
-        self._bodies_made = [wp.empty(b, dtype=dtype, device=self.device) for dtype in of_bodies]
+        self._bodies_made = [self._empty(dtype, model.body_count) for dtype in (wp.transform, wp.spatial_vector)]
 
     def launch(self, step: Step, count: int, following: Following | None = None) -> None:
         """Launch a step of ``count`` substeps. A failure in one substep of a world undoes and ends the world's step.
@@ -103,7 +109,7 @@ class Steps:
                 copied = number == 0 and before is self._particles_before
                 self._launch_gathering(now, state_in, number, copied)
                 if due and following is not None:
-                    following.measure(now, dt - done, each)
+                    following.measure(self.contacts.particles(now), dt - done, each)
                     if self.device.is_cpu and not self.device.is_capturing:
                         left = following.count_for(dt - done)
                         each = (dt - done) / left
@@ -113,7 +119,7 @@ class Steps:
         if self.others.has_bodies:
             inputs = [self.model.body_world, self.report.trouble, state_in.body_q, state_in.body_qd]
             outputs = [state_out.body_q, state_out.body_qd]
-            self._launch(FINISH_BODIES, self.model.body_count, [*inputs, *self._bodies_made], outputs)
+            self._launch(kernels.FINISH_BODIES, self.model.body_count, [*inputs, *self._bodies_made], outputs)
         self.tetrahedra.write_attributes(state_out)
         if following is not None:
             following.made = number
@@ -133,27 +139,30 @@ class Steps:
         substep = step._replace(state_in=now, dt=each)
         self._launch_forces(substep, step.state_in, each / step.dt, done)
         self._launch_motion(substep, RUNAWAY if following is None else min(RUNAWAY, following.reach / each))
-        self._launch_undoing(step.state_out, before)
+        if self.report.may_be_wrong:
+            # Particles in the worlds with a failure are where they were.
+            inputs = [self.model.particle_world, self.report.trouble, *before, *self._nothing]
+            outputs = [step.state_out.particle_q, step.state_out.particle_qd]
+            self._launch(kernels.FINISH_PARTICLES, self.model.particle_count, inputs, outputs)
 
     def reset(self, state: newton.State, mask: wp.array, flags: int) -> None:
-        bits = newton.StateFlags
+        """Reset what this package steps in the chosen worlds of a state; see ``SolverCorotated.reset``."""
+        kinds = [("particle", kernels.RESET_PARTICLES)] + [("body", kernels.RESET_BODIES)] * self.others.has_bodies
+        for kind, kernel in kinds:
+            names = (f"{kind}_q", f"{kind}_qd")
+            initial = [getattr(self.model, name) for name in names]
+            # Those that are not reset are left out.
+            values = [getattr(state, name)[: None if flags & FLAGS[name] else 0] for name in names]
+            inputs = [getattr(self.model, f"{kind}_world"), mask, *initial]
+            self._launch(kernel, len(initial[0]), inputs, values)
         self.contacts.forget()
-        if flags & bits.PARTICLE:
-            self._reset(RESET_PARTICLES, "particle", mask, state, flags & bits.PARTICLE_Q, flags & bits.PARTICLE_QD)
+        if flags & newton.StateFlags.PARTICLE:
             self.tetrahedra.write_attributes(state)
-        if self.others.has_bodies and flags & (bits.BODY_Q | bits.BODY_QD):
-            self._reset(RESET_BODIES, "body", mask, state, flags & bits.BODY_Q, flags & bits.BODY_QD)
-
-    def _reset(
-        self, kernel: wp.Kernel, of: str, mask: wp.array, state: newton.State, with_q: int, with_qd: int
-    ) -> None:
-        model, names = self.model, (f"{of}_q", f"{of}_qd")
-        inputs = [mask, getattr(model, f"{of}_world"), int(bool(with_q)), int(bool(with_qd))]
-        inputs += [getattr(model, name) for name in names]
-        outputs = [getattr(state, name) for name in names]
-        self._launch(kernel, len(outputs[0]), inputs, outputs)
 
     # --- pieces ----------------------------------------------------------------------------------------------------
+
+    def _empty(self, dtype: Any, count: int = 0) -> wp.array:
+        return wp.empty(count, dtype=dtype, device=self.device)
 
     def _launch_begin(self, step: Step) -> list[wp.array]:
         """Launch everything that is done once in a step.
@@ -167,7 +176,7 @@ class Steps:
             particles = self._particles_before
         if model.body_count:
             self._check_bodies(state_in, kernels.BAD_INPUT)
-        self.contacts.begin(step, self.report.trouble)
+        self.contacts.begin(step)
         self._activation = model.tet_activations
         if step.control is not None and step.control.tet_activations is not None:
             self._activation = step.control.tet_activations
@@ -177,14 +186,13 @@ class Steps:
     def _launch_gathering(self, now: newton.State, state_in: newton.State, number: int, copied: bool) -> None:
         """Gather external forces and positions of particles; these are copied if the step begins with them and
         overwrites them."""
-        model, tets = self.model, self.tetrahedra
+        tets = self.tetrahedra
         # If the state was finite before, the step made it infinite.
         wrong = int(kernels.UNSTABLE if number else kernels.BAD_INPUT)
-        inputs = [now.particle_q, now.particle_qd, state_in.particle_f, self.contacts.particles, tets.rest, wrong]
-        copies = self._particles_before if copied else self._nothing
-        memory = self.contacts.memory if number == 0 else [self._no_numbers, self._no_numbers]
-        outputs = [*memory, tets.u, self._f, *copies, self.report.trouble]
-        self._launch(kernels.gather_particles, model.particle_count, inputs, outputs)
+        inputs = [self.contacts.particles(now), state_in.particle_f, tets.rest, wrong]
+        inputs += [self._no_memory if number else self.contacts.memory]
+        outputs = [tets.u, self._f, *(self._particles_before if copied else self._nothing)]
+        self._launch(kernels.gather_particles, self.model.particle_count, inputs, outputs)
 
     def _bodies_after(self, done: float, substep: Step, given: newton.State) -> newton.State:
         """The bodies after some time of the step [s].
@@ -211,8 +219,7 @@ class Steps:
             done: Time of the step that has passed [s].
         """
         self.tetrahedra.add_forces(substep.state_in, self._activation, self._f)
-        of_bodies = self._bodies_after(done, substep, given)
-        self.contacts.add_forces(substep, of_bodies, self._f, self.report.trouble, share)
+        self.contacts.add_forces(substep, self._bodies_after(done, substep, given), self._f, share)
         self._launch_reactions(given, share)
 
     def _launch_reactions(self, given: newton.State, share: float) -> None:
@@ -222,11 +229,11 @@ class Steps:
             target, share = self._body_f, 1.0
             wp.copy(target, given.body_f)
         if self.model.body_count:
-            inputs = [share, self.contacts.reactions]
-            self._launch(kernels.add_wrenches, self.model.body_count, inputs, [target])
+            inputs = [share, self.contacts.reactions, target]
+            self._launch(kernels.add_wrenches, self.model.body_count, inputs)
 
     def _launch_motion(self, substep: Step, fastest: float) -> None:
-        model, others = self.model, self.others
+        model, others, particles = self.model, self.others, self.contacts.particles(substep.state_in)
         now, out, dt = substep.state_in, substep.state_out, substep.dt
         count = self._steps_of_others(dt)
         part = substep._replace(dt=dt / count)
@@ -234,12 +241,9 @@ class Steps:
             others.step(part, self._body_f if others.has_bodies else now.body_f)
             part = part._replace(state_in=out)
         if others.has_particles:
-            inputs = [dt, self.contacts.particles, now.particle_qd, others.moved[1]]
-            self._launch(kernels.add_changes, model.particle_count, inputs, [self._f])
-        inputs = [dt, self.damping, model.particle_max_velocity, fastest, self.contacts.particles, self._f]
-        inputs += [now.particle_q, now.particle_qd, *self._motions]
-        outputs = [out.particle_q, out.particle_qd, self.report.trouble]
-        self._launch(kernels.step_particles, model.particle_count, inputs, outputs)
+            self._launch(kernels.add_changes, model.particle_count, [dt, particles, others.moved[1], self._f])
+        inputs = [dt, self.damping, model.particle_max_velocity, fastest, particles, self._f, *self._motions]
+        self._launch(kernels.step_particles, model.particle_count, inputs, [out.particle_q, out.particle_qd])
         if others.has_bodies:
             self._check_bodies(out, kernels.UNSTABLE)
 
@@ -248,17 +252,7 @@ class Steps:
         return 1
 
     def _check_bodies(self, state: newton.State, wrong: int) -> None:
-        inputs = [state.body_q, state.body_qd, self.model.body_world, int(wrong)]
-        self._launch(kernels.check_bodies, self.model.body_count, inputs, [self.report.trouble])
-
-    def _launch_undoing(self, out: newton.State, before: list[wp.array]) -> None:
-        """Restore particles in the worlds with a failure."""
-        if self.report.may_be_wrong:
-            inputs = [self.model.particle_world, self.report.trouble, *before, *self._nothing]
-            self._launch(FINISH_PARTICLES, self.model.particle_count, inputs, [out.particle_q, out.particle_qd])
-
-    def _launch(self, kernel: wp.Kernel, dim: int, inputs: list, outputs: list) -> None:
-        wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)
+        self._launch(kernels.check_bodies, self.model.body_count, [self.contacts.bodies(state), int(wrong)])
 
 
 class Report:
@@ -288,8 +282,8 @@ class Report:
     def launch(self) -> None:
         """Launch the kernel that stores the failures of a step, at its end."""
         if self.may_be_wrong:
-            outputs = [self._found, self._seen.array]
-            wp.launch(kernels.report_trouble, len(self.trouble), [self.trouble], outputs, device=self._device)
+            arguments = [self.trouble, self._found, self._seen.array]
+            wp.launch(kernels.report_trouble, len(self.trouble), arguments, device=self._device)
 
     def check_earlier(self, following: Following | None) -> None:
         """Report errors of steps that have finished. On CUDA, outside captures; does not wait.
@@ -306,7 +300,7 @@ class Report:
             warnings.warn(str(error), UserWarning, stacklevel=3)
 
     def check(self, stable_dt: float | None, following: Following | None) -> None:
-        """See ``SolverCorotated.check``."""
+        """See ``SolverCorotated.check``. After an unstable step there are more substeps if these follow the state."""
         report = self._found.numpy().copy()
         if not report.any():
             return
@@ -319,16 +313,12 @@ class Report:
             raise InputError(f"state_in is not finite{where}; state_out keeps its former values there")
         if worst in _NO_ROOM:
             raise InputError(f"there are more {_NO_ROOM[worst]}{where}; no step was made")
-        raise UnstableError(self._unstable(where, stable_dt, following))
-
-    def _unstable(self, where: str, stable_dt: float | None, following: Following | None) -> str:
-        """The message; from now on steps have more substeps if these follow the state."""
         hint = "" if stable_dt is None else f"; the largest stable step at rest is about {stable_dt:.3g} s"
         wrong = "not finite" if following is None else "not finite or beyond reason"
         if following is not None:
             following.share *= 0.5
             hint += "; from now on steps have twice the substeps, recorded ones when they are recorded again"
-        return f"the step's result is {wrong}{where}; that state was not changed{hint}"
+        raise UnstableError(f"the step's result is {wrong}{where}; that state was not changed{hint}")
 
 
 class Recordings:

@@ -5,14 +5,16 @@ from __future__ import annotations
 
 import math
 from contextlib import AbstractContextManager, nullcontext
+from functools import partial
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import warp as wp
 
 from warp_corot.elasticity import Corotated
-from warp_corot.errors import InputError
 from warp_corot.kernels.newton import elements as of_elements
+from warp_corot.kernels.newton.particles import Particles
 from warp_corot.kernels.stepping import stability
 from warp_corot.kernels.stepping.stability import add_scaled
 from warp_corot.mesh.topology import linked, node_pairs
@@ -39,6 +41,11 @@ STRIDE = 0.5
 #: Number of attempts to lengthen a step, and the largest eigenvalue, of 4, from which it is long enough.
 LENGTHENINGS = 6
 ENOUGH = 3.95
+#: The arrays of ``kernels.newton.elements.SafeSubstep`` on the device: names, shapes and types.
+SAFE: tuple[tuple[str, Any, Any], ...] = (
+    *(("at_rest", (1, 4), wp.float64), ("found", (1, 3), wp.float32), ("allowed", 1, wp.float64)),
+    *(("turn", 1, wp.int32), ("excess", 1, wp.float32)),
+)
 
 
 class _SmallMotions:
@@ -49,15 +56,15 @@ class _SmallMotions:
     its moduli.
     """
 
-    def __init__(self, tets: Tetrahedra, others: Others, a: float, b: float, stiffness: float, damping: float):
-        self.tets, self.others, self._scales, self._at_particles = tets, others, (a, b), a * stiffness + b * damping
+    def __init__(self, tets: Tetrahedra, others: Others, a: float, b: float, at_particles: float):
+        self._tets, self._others, self._at_particles = tets, others.linear_forces(a, b), at_particles
         mu, lam, viscosity = (array.numpy().astype(np.float64) for array in (tets.mu, tets.lam, tets.k_damp))
         moduli = (a * mu + 0.5 * b * viscosity, a * lam + b * viscosity)
         self._moduli = [wp.array(m, dtype=wp.float32, device=tets.device) for m in moduli]
 
     def add_forces(self, u: wp.array, f: wp.array) -> None:
-        self.tets.add_linear_forces(u, f, self._moduli)
-        self.others.add_linear_forces(*self._scales, u, f)
+        self._tets.add_linear_forces(u, f, self._moduli)
+        self._others(u, f)
         wp.launch(add_scaled, dim=len(u), inputs=[-self._at_particles, u], outputs=[f], device=u.device)
 
     def state_kept(self) -> AbstractContextManager[None]:
@@ -82,13 +89,11 @@ def stable_step(tets: Tetrahedra, others: Others, stiffness: float = 0.0, dampin
     smallest = float(tets.elements.volume.numpy().astype(np.float64).min())
 
     def largest(a: float, b: float) -> float:
-        motions = _SmallMotions(tets, others, a, b, stiffness, damping)
+        motions = _SmallMotions(tets, others, a, b, a * stiffness + b * damping)
         return largest_eigenvalue(motions, inverse_mass, smallest, len(inverse))
 
     w2 = largest(1.0, 0.0)
-    if not (tets.damped or others.damped or damping > 0):
-        return 2.0 / math.sqrt(w2) if w2 > 0 else math.inf
-    c = largest(0.0, 1.0)
+    c = largest(0.0, 1.0) if tets.damped or others.damped or damping > 0 else 0.0
     if w2 == 0.0 and c == 0.0:
         return math.inf
     dt = 4.0 / (c + math.sqrt(c * c + 4.0 * w2))
@@ -113,21 +118,6 @@ def stable_steps(tets: Tetrahedra, others: Others) -> tuple[float, float]:
     return alone, min(alone, stable_step(tets, others, *others.contact)) if any(others.contact) else alone
 
 
-def check_substep(dt: float, count: int, stable_dt: float, contact_dt: float) -> None:
-    """Check a step of ``dt`` in ``count`` substeps against the result of ``stable_steps`` [s].
-
-    Raises:
-        InputError: The substeps are too long.
-    """
-    if dt / count > stable_dt:
-        each = f", {count} substeps of {dt / count:.3g} s" if count > 1 else ""
-        needed = math.ceil(dt / (SAFETY * contact_dt))
-        raise InputError(
-            f"dt is {dt:.3g} s{each}; the largest stable step is about {stable_dt:.3g} s: "
-            f"make shorter steps, or SolverCorotated(..., substeps={needed}), or substeps=None"
-        )
-
-
 class Following:
     """The safe substep of a model, which follows the state by launches that may be recorded.
 
@@ -148,14 +138,13 @@ class Following:
     def __init__(self, model: newton.Model, tetrahedra: Tetrahedra):
         self.model, self.tetrahedra = model, tetrahedra
         self.device = model.device
+        self._launch = partial(wp.launch, device=self.device)
         self._f = wp.zeros(model.particle_count, dtype=wp.vec4, device=self.device)
-        self._found = wp.zeros((1, 3), dtype=wp.float32, device=self.device)
-        self._curvature = Curvature(model.particle_count, self._found[0])
-        self._at_rest = wp.zeros((1, 4), dtype=wp.float64, device=self.device)
-        self._allowed = wp.zeros(1, dtype=wp.float64, device=self.device)
-        self._turn = wp.zeros(1, dtype=wp.int32, device=self.device)
-        self._excess = wp.zeros(1, dtype=wp.float32, device=self.device)
-        self._seen = Mapped(1, self.device)
+        self._seen, self._safe = Mapped(1, self.device), of_elements.SafeSubstep()
+        for name, shape, dtype in SAFE:
+            setattr(self._safe, name, wp.zeros(shape, dtype=dtype, device=self.device))
+        self._safe.seen = self._seen.array
+        self._curvature = Curvature(model.particle_count, self._safe.found[0])
         self.share, self.made, self.was_recorded = 1.0, 1, False
         self.reach = _size(model, tetrahedra.tets)
         self._since, self._recording = INTERVAL, False
@@ -173,14 +162,15 @@ class Following:
         curvature = self._curvature.at_rest(tets.add_linear_forces, self._inverse_mass, len(inverse))
         row = [stable, curvature, Corotated.step_safety, Corotated.strained_safety]
         self._longest = stable * Corotated.step_safety
-        self._stride, self._falls = 0.0, INTERVAL * float(np.linalg.norm(self.model.gravity.numpy(), axis=1).max())
+        safe = self._safe
+        safe.stride, safe.falls = 0.0, INTERVAL * float(np.linalg.norm(self.model.gravity.numpy(), axis=1).max())
         if self.model.shape_count:
-            self._stride = STRIDE * float(tets.elements.volume.numpy().min()) ** (1 / 3)
-            self._longest = min(self._longest, math.sqrt(self._stride / max(self._falls, 1e-30)))
+            safe.stride = STRIDE * float(tets.elements.volume.numpy().min()) ** (1 / 3)
+            self._longest = min(self._longest, math.sqrt(safe.stride / max(safe.falls, 1e-30)))
         if not math.isfinite(stable):
             row[0] = self._longest = 1e30
-        self._at_rest.assign(np.array([row]))
-        self._allowed.fill_(self._longest)
+        safe.at_rest.assign(np.array([row]))
+        safe.allowed.fill_(self._longest)
         self._seen.values[0] = self._longest
         self._since = INTERVAL
 
@@ -208,11 +198,11 @@ class Following:
         self._since = 1 if due else self._since + 1
         return due
 
-    def measure(self, state: newton.State, dt: float, substep: float) -> None:
+    def measure(self, particles: Particles, dt: float, substep: float) -> None:
         """Measure at a state whose displacements have been gathered.
 
         Args:
-            state: The state.
+            particles: The particles in it.
             dt: The remaining time of the step [s].
             substep: The planned length of a substep [s].
         """
@@ -220,14 +210,10 @@ class Following:
         self._f.zero_()
         tets.add_elastic_forces(tets.u, self._f)
         self._curvature.find(tets.add_elastic_forces, self._inverse_mass, tets.u, self._f, model.particle_count)
-        ahead = max(dt, INTERVAL * substep)
-        inputs = [tets.elements, state.particle_q, state.particle_qd, ahead, model.tet_count, self._turn]
-        looked_at = -(-model.tet_count // int(stability.TURNS))
-        self._launch(of_elements.find_posed_strains, inputs, [self._found], looked_at)
-        recorded = substep if self.device.is_capturing else 0.0
-        inputs = [self._at_rest, wp.float64(recorded), self._stride, self._falls]
-        outputs = [self._found, self._allowed, self._turn, self._excess, self._seen.array]
-        self._launch(of_elements.take_safe_substep, inputs, outputs, 1)
+        inputs = [tets.elements, particles, max(dt, INTERVAL * substep), model.tet_count, self._safe]
+        self._launch(of_elements.find_posed_strains, -(-model.tet_count // int(stability.TURNS)), inputs)
+        recorded = wp.float64(substep if self.device.is_capturing else 0.0)
+        self._launch(of_elements.take_safe_substep, 1, [recorded, self._safe])
         self.recover()
 
     def recover(self) -> None:
@@ -236,13 +222,9 @@ class Following:
 
     def take_excess(self) -> float:
         """The largest factor by which recorded substeps were too long since the last call; waits for the device."""
-        excess = float(self._excess.numpy()[0])
-        if excess > 0.0:
-            self._excess.zero_()
+        excess = float(self._safe.excess.numpy()[0])
+        self._safe.excess.zero_()
         return excess
-
-    def _launch(self, kernel: wp.Kernel, inputs: list, outputs: list, dim: int) -> None:
-        wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)
 
 
 def _size(model: newton.Model, tets: npt.NDArray[np.integer]) -> float:

@@ -22,7 +22,7 @@ from warp_corot.newton.library import newton
 from warp_corot.newton.solver import SolverCorotated
 from warp_corot.newton.substeps import INTERVAL, RETRIES
 
-from .stage import TOUCHING, StageModel, StageOptions, stage_model
+from .stage import StageModel, StageOptions
 
 #: Maximum number of steps that are recorded together, with one measurement; a frame is a whole number of chunks. On the
 #: CPU recording a step takes as long as ten steps.
@@ -94,7 +94,7 @@ class StageSimulation:
         if not (math.isfinite(self.fps) and self.fps > 0):
             raise InputError(f"fps is {self.fps:g}; it must be a positive number")
         self._is_implicit = integrator == "implicit"
-        self.parts = stage_model(self.scene, options or StageOptions(), checked_device(device))
+        self.parts = StageModel(self.scene, options or StageOptions(), checked_device(device))
         model = self.parts.model
         if self._is_implicit and self.parts.thickness is not None:
             self.parts.thickness = None
@@ -117,7 +117,7 @@ class StageSimulation:
             )
         self._contacts = self._pipeline.contacts()
         self._pipeline.collide(model.state(), self._contacts)
-        warn_of_overlaps(self.parts, self._contacts)
+        self.parts.warn_of_overlaps(self._contacts)
         self.state, self._kept = self._new_state(), self._new_state()
         # Shares its positions with the state; it has stresses, which are needed once a frame and not once a step.
         self._shown = model.state()
@@ -275,34 +275,3 @@ class StageSimulation:
         state.clear_forces()
         self._pipeline.collide(state, self._contacts, soft_self_contact=self._touch)
         self.solver.step(state, state, None, self._contacts, self.dt)
-
-
-def warn_of_overlaps(made: StageModel, contacts: newton.Contacts) -> None:
-    """Warn of soft bodies that begin in colliders, from which contact will push them.
-
-    Args:
-        made: The stage's model.
-        contacts: Contacts of its initial state.
-    """
-    model, metres = made.model, made.scene.units.metres
-    count = min(int(contacts.soft_contact_count.numpy()[0]), contacts.soft_contact_max)
-    fields = (contacts.soft_contact_particle, contacts.soft_contact_shape, contacts.soft_contact_body_pos)
-    particle, shape, point = (array.numpy()[:count] for array in fields)
-    normal = contacts.soft_contact_normal.numpy()[:count].astype(np.float64)
-    x, point = model.particle_q.numpy().astype(np.float64)[particle], point.astype(np.float64)
-    owner = model.shape_body.numpy()[shape]
-    if (moving := owner >= 0).any():
-        pose = model.body_q.numpy().astype(np.float64)[owner[moving]]
-        point[moving] = Rotation.from_quat(pose[:, 3:]).apply(point[moving]) + pose[:, :3]
-    gap = np.einsum("ci,ci->c", normal, x - point) - model.particle_radius.numpy()[particle]
-    gap[model.particle_inv_mass.numpy()[particle] == 0.0] = np.inf
-    for body in made.soft:
-        inside = (particle >= body.particles.start) & (particle < body.particles.stop)
-        inside &= gap < -TOUCHING * body.edge / metres
-        for one in np.unique(shape[inside]):
-            deep = -gap[inside & (shape == one)].min() * metres
-            warnings.warn(
-                f"{body.prim.path} begins {deep:.3g} m deep in {model.shape_label[one]}, and contact will throw it out",
-                UserWarning,
-                stacklevel=3,
-            )

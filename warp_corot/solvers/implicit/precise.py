@@ -163,7 +163,7 @@ ROUNDED = 1e-8
 
 
 class HostContact(Protocol):
-    """Contact of one world in float64, such as ``gradients.precise_contact.PreciseContact``, which explains the
+    """Contact of one world in float64, such as ``gradients.contact.PreciseContact``, which explains the
     members."""
 
     count: int
