@@ -23,11 +23,13 @@ from warp_corot.kernels.remesh.pools import (
     FULL,
     LAST_BIRTHS,
     LEAVES,
+    NEW_LEAVES,
     NODE_TOP,
     NODES_TAKEN,
     PAIRS_TAKEN,
     PASS_STAMP,
     REFINE,
+    REMOVED,
     STAMP,
     WANTED,
     Carried,
@@ -214,23 +216,6 @@ def heat_wanted(
         heat_blocks(a, b, pools.counts[STAMP], pools.counts[FIRST_NEW], blocks)
 
 
-@wp.kernel(enable_backward=False)
-def begin_round(
-    # In and out
-    pools: Pools,
-    demand: wp.array[wp.int64],
-):
-    counts = pools.counts
-    counts[STAMP] = counts[STAMP] + 1
-    counts[LAST_BIRTHS] = counts[BIRTHS]
-    counts[BIRTHS] = 0
-    counts[FRESH_SEEN] = counts[FRESH_NEW]
-    counts[FRESH_NEW] = counts[FRESH]
-    counts[NODES_TAKEN] = 0
-    counts[PAIRS_TAKEN] = 0
-    demand[0] = wp.int64(0)
-
-
 @wp.func
 def count_at_edges(e: int, tet: wp.vec4i, is_new: bool, pools: Pools, edges: WantedEdges, blocks: Blocks):
     """Count a leaf at its wanted edges, each once: an old leaf at those of the last round, a new one at all."""
@@ -309,24 +294,6 @@ def visit_fresh(
         e = pools.fresh[i // 2] + i % 2
         if pools.first_child[e] == LIVE:
             count_at_edges(e, pools.tets[e], i // 2 >= pools.counts[FRESH_SEEN], pools, edges, blocks)
-
-
-@wp.kernel(enable_backward=False)
-def clear_edges(
-    # In
-    threads: int,
-    pools: Pools,
-    # In and out
-    edges: WantedEdges,
-):
-    for i in range(wp.tid(), pools.counts[WANTED], threads):
-        slot = edges.wanted[i]
-        edges.keys[slot] = EMPTY
-        edges.born[slot] = NEVER
-        edges.ring[slot] = 0
-        edges.agreed[slot] = 0
-        edges.head[slot] = -1
-        edges.node[slot] = -1
 
 
 # The upper half of ``demand`` counts nodes, the lower half pairs.
@@ -466,24 +433,49 @@ def bisect_edges(
 
 
 @wp.kernel(enable_backward=False)
-def end_round(
+def next_round(
     # In and out
     pools: Pools,
+    demand: wp.array[wp.int64],
     # Out
     goes_on: wp.array[wp.int32],
 ):
+    """End a round, if there was one, and begin the next."""
     counts = pools.counts
     counts[NODE_TOP] = counts[NODE_TOP] + counts[NODES_TAKEN]
     counts[FREE_PAIRS] = counts[FREE_PAIRS] - counts[PAIRS_TAKEN]
     counts[ADDED] = counts[ADDED] + counts[NODES_TAKEN]
     goes_on[0] = wp.where(counts[BIRTHS] + counts[NODES_TAKEN] > 0, 1, 0)
+    counts[STAMP] = counts[STAMP] + 1
+    counts[LAST_BIRTHS] = counts[BIRTHS]
+    counts[BIRTHS] = 0
+    counts[FRESH_SEEN] = counts[FRESH_NEW]
+    counts[FRESH_NEW] = counts[FRESH]
+    counts[NODES_TAKEN] = 0
+    counts[PAIRS_TAKEN] = 0
+    demand[0] = wp.int64(0)
 
 
 @wp.kernel(enable_backward=False)
-def begin_rounds(
+def end_pass(
     # In
+    threads: int,
+    # In and out
     pools: Pools,
-    # Out
-    goes_on: wp.array[wp.int32],
+    edges: WantedEdges,
+    moved: wp.array[wp.int32],
 ):
-    goes_on[0] = wp.where(pools.counts[BIRTHS] > 0, 1, 0)
+    """Clear the table of edges and the counts of moved nodes, and adopt the number of leaves."""
+    for i in range(wp.tid(), pools.counts[WANTED], threads):
+        slot = edges.wanted[i]
+        edges.keys[slot] = EMPTY
+        edges.born[slot] = NEVER
+        edges.ring[slot] = 0
+        edges.agreed[slot] = 0
+        edges.head[slot] = -1
+        edges.node[slot] = -1
+    if wp.tid() == 0:
+        moved[0] = 0
+        moved[1] = 0
+        if pools.counts[ADDED] + pools.counts[REMOVED] > 0:
+            pools.counts[LEAVES] = pools.counts[NEW_LEAVES]

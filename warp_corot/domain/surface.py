@@ -14,7 +14,7 @@ import numpy.typing as npt
 import warp as wp
 
 from warp_corot.domain.closing import SurfaceParts, part_volumes
-from warp_corot.domain.signed import SignedFunction
+from warp_corot.domain.domain import Domain
 from warp_corot.domain.units import length, metres_per_unit, unlikely_size, volume
 from warp_corot.errors import InputError
 from warp_corot.inputs.cpu_threads import launch_side_by_side
@@ -40,7 +40,7 @@ START = 0.01
 LARGE_HOLES = 0.01
 
 
-class SurfaceDomain(SignedFunction):
+class SurfaceDomain(Domain):
     """See `Domain.from_surface`.
 
     Args:
@@ -165,7 +165,7 @@ class SurfaceDomain(SignedFunction):
         return [*lines, *(line for happened, line in said if happened)]
 
 
-def surface_domain(surface: Surface, unit: str | float | None, up_axis: str | None, device: Any) -> SignedFunction:
+def surface_domain(surface: Surface, unit: str | float | None, up_axis: str | None, device: Any) -> Domain:
     """See `Domain.from_surface`."""
     from .closing import close_surface
 
