@@ -49,8 +49,7 @@ REMOVED = wp.constant(18)  # nodes removed in this pass
 FULL = wp.constant(19)  # nonzero if a refinement was left out because the pools were full
 OLD_TOP = wp.constant(20)  # NODE_TOP before nodes moved into the places of removed ones
 NEW_LEAVES = wp.constant(21)
-FIRST_NEW = wp.constant(22)  # nodes made in this pass have this number or a higher one, until nodes are removed
-COUNTS = 23
+COUNTS = 22
 
 #: Places past the last possible leaf, for launches that are larger than needed.
 LEAF_PADDING = 1024
@@ -130,7 +129,6 @@ def begin_pass(
     if goes_on == 0:
         counts[ADDED] = 0
     counts[REMOVED] = 0
-    counts[FIRST_NEW] = counts[NODE_TOP]
 
 
 # Rows of keyframes for nodes that follow none, and for held nodes between nodes with different rows.

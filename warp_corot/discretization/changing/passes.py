@@ -169,9 +169,6 @@ class RemeshPass(_Launches):
         self._edges = allocated(refine.WantedEdges, device, of_edges, **begin)
         # Threads that add an edge at the same time may exceed the limit, but never fill the table.
         self._edges.most = size // 2
-        none, blocks = int(refine.NONE), forest.capacity // int(refine.BLOCK) + 1
-        of_blocks = [((nodes, refine.KEPT), "of_node"), (nodes, "latest"), (blocks, "hot"), (1, "all_hot")]
-        self._blocks = allocated(refine.Blocks, device, of_blocks, of_node=none, latest=none)
         self._removal = allocated(simplify.Removal, device, [(nodes, "willing head candidates")], head=-1)
         self._moves = allocated(order.Moves, device, [(nodes, "holes movers forward"), (2, "counts")])
         self._demand = wp.zeros(1, dtype=wp.int64, device=self.device)
@@ -194,9 +191,6 @@ class RemeshPass(_Launches):
             inputs = [refine_above, simplify_below, self._origin, self._spacing, carried.u, self.parameters]
             self._many(self._mark, *inputs, self.contents, pools)
         self._many(refine.want_marked, self.levels[1], pools, edges)
-        self._many(refine.clear_blocks, pools, self._blocks)
-        self._many(refine.list_blocks, pools, self._blocks)
-        self._many(refine.heat_wanted, pools, edges, self._blocks)
         self._once(refine.next_round, pools, self._demand, self._goes_on)
         wp.capture_while(self._goes_on, self._launch_round)
         self._many(simplify.offer_nodes, self.levels[0], self._kept, carried, pools, removal)
@@ -216,8 +210,8 @@ class RemeshPass(_Launches):
 
     def _launch_round(self) -> None:
         pools, edges, carried = self.forest.pools, self._edges, self.forest.carriage.arrays
-        self._many(refine.visit_leaves, pools, edges, self._blocks)
-        self._many(refine.visit_fresh, pools, edges, self._blocks)
+        self._many(refine.visit_leaves, pools, edges)
+        self._many(refine.visit_fresh, pools, edges)
         self._many(refine.admit_edges, pools, edges, self._demand)
         self._many(refine.bisect_edges, pools, edges, carried)
         self._once(refine.next_round, pools, self._demand, self._goes_on)

@@ -104,7 +104,7 @@ class Snapshot:
             array_of(pools, carried, name).fill_(_UNUSED.get(name, 0))
         for name, start, values in self.pieces:
             array_of(pools, carried, name)[start : start + len(values)].assign(values)
-        counts = self.counts.copy()
+        counts = self.counts[: kernels.COUNTS].copy()
         # The count of rounds continues, so that nodes touched in later rounds do not look newly touched.
         counts[kernels.STAMP] = present[kernels.STAMP]
         pools.counts.assign(counts)
