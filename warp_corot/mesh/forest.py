@@ -286,10 +286,10 @@ def refined(forest: TetForest, leaves: np.ndarray) -> TetForest:
     growth = Growth(forest.lattice, forest.node_ends, tree, wp.get_device("cpu"))
     wished = np.zeros(growth.element_count, np.uint8)
     wished[tree.leaves[leaves]] = 1
-    growth.wished.assign(wished)
+    growth.forest.wished.assign(wished)
     if forest.phi is not None:
         # Leaves that were given up as nearly empty still contain a part of the surface.
-        growth.bound.assign((tree.first_child == VOID) & (forest.phi[tree.tets] < 0).any(axis=1))
+        growth.forest.bound.assign((tree.first_child == VOID) & (forest.phi[tree.tets] < 0).any(axis=1))
     growth.close()
     lattice, ends = growth.nodes()
     grown = growth.tree()
