@@ -233,18 +233,3 @@ def flag_hanging(
                         if slot >= 0:
                             flag = int(forest.active[forest.values[slot]])
     flags[i] = flag
-
-
-@wp.kernel(enable_backward=False)
-def gather_flagged(
-    # In
-    flags: wp.array[wp.int32],
-    places: wp.array[wp.int32],
-    first: int,
-    # Out
-    chosen: wp.array[wp.int32],
-):
-    """Indices, from ``first`` on, of flagged entries, in order; ``places`` is the inclusive sum of the flags."""
-    i = wp.tid()
-    if flags[i] != 0:
-        chosen[places[i] - 1] = first + i

@@ -12,8 +12,7 @@ import warp as wp
 
 from warp_corot.kernels.modules import unique_kernel
 
-wp.set_module_options({"enable_backward": False})
-
+# Warp would unroll loops of up to 16 rounds, and compile each round's search by itself.
 wp.set_module_options({"enable_backward": False, "max_unroll": 1})
 
 #: Inclination of lines: metres along the two other axes for each metre along their axis. A box around a line is wider
@@ -151,8 +150,6 @@ def measure_lines(
     lengths[n] = length
 
 
-# Warp would unroll loops of up to 16 rounds, and compile each round's search by itself.
-
 #: Maximum number of triangles of its own part that an edge can pass.
 MOST_OWN_HITS = wp.constant(8)
 #: Fraction of an edge's length that is left out at its ends, where its own triangles begin.
@@ -181,9 +178,9 @@ def find_nearest(
 @unique_kernel()
 def find_crossed_parts(
     # In
-    points: wp.array[wp.vec3],
     edges: wp.array[wp.vec2i],
     edge_parts: wp.array[wp.int32],
+    points: wp.array[wp.vec3],
     mesh: wp.uint64,
     triangle_parts: wp.array[wp.int32],
     # Out

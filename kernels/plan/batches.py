@@ -70,41 +70,30 @@ def is_grouped(c: int, plan: Plan):
 
 
 @wp.func
-def node_place(c: int, k: int, n: int, batches: Batches):
-    """The place of the n-th node of the k-th single subtree of a class."""
-    if batches.by_node != 0:
+def node_count(c: int, plan: Plan):
+    """How many nodes of a class go with each of its subtrees: its own, or an eighth of its group's."""
+    return wp.where(is_grouped(c, plan), GROUP_NODES / 8, SINGLE_NODES)
+
+
+@wp.func
+def node_place(c: int, k: int, n: int, plan: Plan, batches: Batches):
+    """The place of the n-th node that goes with the k-th subtree of a class."""
+    if batches.by_node != 0 and not is_grouped(c, plan):
         return batches.node_begin[c] + n * batches.room[c] + k
-    return batches.node_begin[c] + SINGLE_NODES * k + n
+    return batches.node_begin[c] + node_count(c, plan) * k + n
 
 
 @wp.func
-def share_place(c: int, k: int, n: int, batches: Batches):
-    """The place of the n-th of the five nodes of a group that go with its subtree k of a class."""
-    return batches.node_begin[c] + 5 * k + n
-
-
-@wp.func
-def fill_single(c: int, shape: int, k: int, first: int, shift: int, tree: Tree, batches: Batches):
-    """Nodes of the k-th single subtree of a class; ``first`` is its first leaf, -1 for padding."""
-    for n in range(SINGLE_NODES):
-        node = sink(k, tree)
-        if first >= 0:
-            place = batches.places[shape, n]
+def fill_nodes(c: int, shape: int, k: int, first: int, shift: int, tree: Tree, plan: Plan, batches: Batches):
+    """Nodes that go with the k-th subtree of a class; ``first`` is its first leaf, or its group's, -1 for padding."""
+    for n in range(node_count(c, plan)):
+        place = batches.places[shape, n % SINGLE_NODES]
+        if is_grouped(c, plan):
+            place = batches.group_places[shape, 5 * (k % 8) + n]
+        node = wp.where(place[0] < 0, -1, sink(k, tree))
+        if place[0] >= 0 and first >= 0:
             node = tree.leaf_tets[first + place[0]][place[1]] + shift
-        batches.nodes[node_place(c, k, n, batches)] = node
-
-
-@wp.func
-def fill_share(c: int, shape: int, k: int, first: int, shift: int, tree: Tree, batches: Batches):
-    """Five nodes of the group with the k-th subtree of a class; ``first`` is the group's first leaf, or -1."""
-    for n in range(5):
-        place = batches.group_places[shape, 5 * (k % 8) + n]
-        node = int(-1)
-        if place[0] >= 0:
-            node = sink(k, tree)
-            if first >= 0:
-                node = tree.leaf_tets[first + place[0]][place[1]] + shift
-        batches.nodes[share_place(c, k, n, batches)] = node
+        batches.nodes[node_place(c, k, n, plan, batches)] = node
 
 
 @wp.kernel(enable_backward=False)
@@ -121,7 +110,6 @@ def fill_batches(
     c, t = wp.tid()
     kind = kind_of_class(c, plan)
     shape = shape_of_kind(kind, plan)
-    grouped = is_grouped(c, plan)
     places = extent(c, plan)
     begin = plan.begin[c]
     for k in range(t, plan.worlds * places, threads):
@@ -145,12 +133,9 @@ def fill_batches(
             if kind > 3:
                 batches.unit[place] = 0
         batches.code[place] = code
-        if not grouped:
-            fill_single(c, shape, k, first, shift, tree, batches)
-        else:
-            if first >= 0:
-                first -= LEAVES_OF_SUBTREE * (in_world % 8)
-            fill_share(c, shape, k, first, shift, tree, batches)
+        if first >= 0 and is_grouped(c, plan):
+            first -= LEAVES_OF_SUBTREE * (in_world % 8)
+        fill_nodes(c, shape, k, first, shift, tree, plan, batches)
 
 
 @wp.kernel(enable_backward=False)

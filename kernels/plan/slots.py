@@ -8,13 +8,12 @@ import warp as wp
 
 from .batches import (
     GROUP_NODES,
-    SINGLE_NODES,
     Batches,
     is_grouped,
     kind_of_class,
+    node_count,
     node_place,
     shape_of_kind,
-    share_place,
 )
 from .lists import LEAVES_OF_SUBTREE
 from .plan import Plan, Tree, extent, places_t
@@ -55,20 +54,15 @@ def target_subtrees(
         world = k / count
         in_world = k - world * count
         start = world * targets.per_world + targets.begin[c]
-        width = int(SINGLE_NODES)
+        behind = int(0)
         if grouped:
             start += GROUP_NODES * (in_world / 8)
-            width = 5
+            behind = 5 * (k % 8)
         else:
-            start += SINGLE_NODES * in_world
-        for n in range(width):
-            slot = start + n
-            place = int(0)
-            if grouped:
-                slot += 5 * (k % 8)
-                place = share_place(c, k, n, batches)
-            else:
-                place = node_place(c, k, n, batches)
+            start += node_count(c, plan) * in_world
+        for n in range(node_count(c, plan)):
+            slot = start + behind + n
+            place = node_place(c, k, n, plan, batches)
             node = batches.nodes[place]
             if world == 0:
                 targets.nodes[slot] = wp.where(node < 0, targets.no_node, node)
@@ -103,15 +97,6 @@ def target_flat(
 
 
 @wp.kernel(enable_backward=False)
-def number_slots(
-    # Out
-    slots: wp.array[wp.int32],
-):
-    i = wp.tid()
-    slots[i] = i
-
-
-@wp.kernel(enable_backward=False)
 def find_starts(
     # In
     count: int,
@@ -123,16 +108,8 @@ def find_starts(
 ):
     """Where each node's slots begin among ``count`` slots sorted by node, ``there`` of which are used."""
     world, node = wp.tid()
-    low = int(0)
-    high = int(count)
-    while low < high:
-        middle = low + (high - low) / 2
-        if nodes[middle] < node:
-            low = middle + 1
-        else:
-            high = middle
     # The end of one world is the start of the next.
-    starts[world * world_nodes + node] = world * there + low
+    starts[world * world_nodes + node] = world * there + wp.lower_bound(nodes, 0, count + 1, node)
 
 
 @wp.kernel(enable_backward=False)

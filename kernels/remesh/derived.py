@@ -4,8 +4,6 @@ limits of the time step.
 The limits are those of the stiffest elements for their size and mass, and their number: an element among elements of
 its size vibrates faster than one among larger ones, so the finest level alone is not enough."""
 
-from typing import Any
-
 import warp as wp
 
 from warp_corot.kernels.corotated.anisotropic import vec9
@@ -141,55 +139,14 @@ def assemble_materials(
             stiffness[i] = c
 
 
-@wp.kernel(enable_backward=False)
-def write_leaves(
-    # In
-    leaves: wp.array[wp.int32],
-    given: wp.array[Any],
-    column: int,
-    # Out
-    columns: wp.array2d[Any],
-):
-    """Write values given by places in the list into the leaves' data."""
-    i = wp.tid()
-    columns[leaves[i], column] = given[i]
-
-
-@wp.kernel(enable_backward=False)
-def read_leaves(
-    # In
-    leaves: wp.array[wp.int32],
-    columns: wp.array2d[Any],
-    column: int,
-    # Out
-    found: wp.array[Any],
-):
-    i = wp.tid()
-    found[i] = columns[leaves[i], column]
-
-
-def _by_type(kernel: wp.Kernel, of_leaves: str) -> dict[type, wp.Kernel]:
-    """The kernel for values and for whole numbers, chosen once and not at every launch."""
-    return {
-        kind: wp.overload(kernel, {of_leaves: wp.array(dtype=kind), "columns": wp.array2d(dtype=kind)})
-        for kind in (wp.float32, wp.int32)
-    }
-
-
-WRITE_LEAVES = _by_type(write_leaves, "given")
-READ_LEAVES = _by_type(read_leaves, "found")
-
-
-# Places in the result; from FINEST_COUNTS on there are partial sums.
+#: The result: the stiffest element, then for each level some sums whose total is, for the finest level, the number of
+#: its leaves; of other levels threads with finer leaves count none.
 STIFFEST = wp.constant(0)
-FINEST_LEVEL = wp.constant(1)
-FINEST_COUNTS = wp.constant(2)
-PARTIAL_SUMS = wp.constant(256)
-SURVEY_PLACES = 258
+PARTIAL_SUMS = wp.constant(16)
 
 
 @wp.kernel(enable_backward=False)
-def find_stiffest(
+def survey_leaves(
     # In
     threads: int,
     goes: wp.array[wp.int32],
@@ -199,41 +156,28 @@ def find_stiffest(
     # Out
     found: wp.array[wp.int32],
 ):
-    """Largest (2 mu + lambda) / (density volume^(2/3)) [1/s^2] of the leaves, as a float's bits, and the finest level.
+    """Largest (2 mu + lambda) / (density volume^(2/3)) [1/s^2] of the leaves, as a float's bits, and the number of
+    leaves of the finest level.
 
     ``modulus`` is 2 mu + lambda [Pa] if all elements have the same.
     """
     count = wp.where(goes[0] != 0, pools.counts[LEAVES], 0)
     most = float(0.0)
     finest = int(0)
+    own = int(0)
     for i in range(wp.tid(), count, threads):
         e = pools.leaves[i]
         level = pools.level[e]
         size = carried.size[level]
         most = wp.max(most, modulus_of(e, modulus, carried) / float(carried.density[e] * size * size))
-        finest = wp.max(finest, level)
+        if level > finest:
+            finest = level
+            own = 0
+        if level == finest:
+            own += 1
     # Positive floats have the order of their bits. Few threads reach the write.
     bits = wp.cast(most, wp.int32)
     if bits > found[STIFFEST]:
         wp.atomic_max(found, STIFFEST, bits)
-    if finest > found[FINEST_LEVEL]:
-        wp.atomic_max(found, FINEST_LEVEL, finest)
-
-
-@wp.kernel(enable_backward=False)
-def count_finest(
-    # In
-    threads: int,
-    goes: wp.array[wp.int32],
-    pools: Pools,
-    # In and out
-    found: wp.array[wp.int32],
-):
-    """Number of leaves at the finest level, in partial sums."""
-    count = wp.where(goes[0] != 0, pools.counts[LEAVES], 0)
-    own = int(0)
-    for i in range(wp.tid(), count, threads):
-        if pools.level[pools.leaves[i]] == found[FINEST_LEVEL]:
-            own += 1
     if own > 0:
-        wp.atomic_add(found, FINEST_COUNTS + wp.tid() % PARTIAL_SUMS, own)
+        wp.atomic_add(found, 1 + PARTIAL_SUMS * finest + wp.tid() % PARTIAL_SUMS, own)

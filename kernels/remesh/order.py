@@ -1,8 +1,8 @@
 """Renumbers nodes without gaps after a removal, and restores the tree order of the leaves after a pass.
 
 With N' nodes left, the holes are the places of removed nodes below N', and the movers are the nodes from N' on; their
-numbers are equal. The k-th mover moves into the k-th hole, independently of the threads. Its number is changed in
-leaves and, upwards from these, in their ancestors, and in the ends of other nodes.
+numbers are equal. Each mover moves into a hole. Its number is changed in tetrahedra of all levels, and in the ends of
+other nodes.
 
 Each thread processes one stretch of the former list of leaves: a bisected leaf is replaced by its descendants, a merged
 one by its parent. A sum over the threads gives the start of each."""
@@ -30,45 +30,10 @@ wp.set_module_options({"enable_backward": False})
 class Moves:
     """The moves in the current pass."""
 
-    sums: wp.array[wp.int32]  # [2 * threads] holes in each thread's stretch of the nodes, then movers
-    ends: wp.array[wp.int32]  # inclusive sums of these
+    counts: wp.array[wp.int32]  # [2] of holes and of movers, which are equal
     holes: wp.array[wp.int32]
     movers: wp.array[wp.int32]
     forward: wp.array[wp.int32]  # new numbers of movers by their old ones
-
-
-@wp.func
-def walk_nodes(t: int, threads: int, first_hole: int, first_mover: int, writes: bool, pools: Pools, moves: Moves):
-    """The places after the holes and movers in a thread's stretch, which begin at these; lists them if asked."""
-    hole = int(first_hole)
-    mover = int(first_mover)
-    if pools.counts[REMOVED] > 0:
-        top = pools.counts[NODE_TOP] - pools.counts[REMOVED]
-        stretch = (pools.counts[NODE_TOP] + threads - 1) / threads
-        for i in range(t * stretch, wp.min((t + 1) * stretch, pools.counts[NODE_TOP])):
-            if i < top and pools.valence[i] == 0:
-                if writes:
-                    moves.holes[hole] = i
-                hole += 1
-            elif i >= top and pools.valence[i] > 0:
-                if writes:
-                    moves.movers[mover] = i
-                mover += 1
-    return hole, mover
-
-
-@wp.kernel(enable_backward=False)
-def count_moves(
-    # In
-    threads: int,
-    pools: Pools,
-    # Out
-    moves: Moves,
-):
-    t = wp.tid()
-    holes, movers = walk_nodes(t, threads, 0, 0, False, pools, moves)
-    moves.sums[t] = holes
-    moves.sums[threads + t] = movers
 
 
 @wp.kernel(enable_backward=False)
@@ -79,20 +44,13 @@ def list_moves(
     # In and out
     moves: Moves,
 ):
-    t = wp.tid()
-    hole = moves.ends[t] - moves.sums[t]
-    mover = moves.ends[threads + t] - moves.sums[threads + t] - moves.ends[threads - 1]
-    walk_nodes(t, threads, hole, mover, True, pools, moves)
-
-
-@wp.kernel(enable_backward=False)
-def lower_top(
-    # In and out
-    pools: Pools,
-):
-    counts = pools.counts
-    counts[OLD_TOP] = counts[NODE_TOP]
-    counts[NODE_TOP] = counts[NODE_TOP] - counts[REMOVED]
+    top = pools.counts[NODE_TOP] - pools.counts[REMOVED]
+    count = wp.where(pools.counts[REMOVED] > 0, pools.counts[NODE_TOP], 0)
+    for i in range(wp.tid(), count, threads):
+        if i < top and pools.valence[i] == 0:
+            moves.holes[wp.atomic_add(moves.counts, 0, 1)] = i
+        elif i >= top and pools.valence[i] > 0:
+            moves.movers[wp.atomic_add(moves.counts, 1, 1)] = i
 
 
 @wp.kernel(enable_backward=False)
@@ -104,7 +62,8 @@ def move_nodes(
     carried: Carried,
     moves: Moves,
 ):
-    for k in range(wp.tid(), moves.ends[threads - 1], threads):
+    """Move nodes into the holes, and lower the number of nodes."""
+    for k in range(wp.tid(), moves.counts[0], threads):
         mover = moves.movers[k]
         hole = moves.holes[k]
         moves.forward[mover] = hole
@@ -113,6 +72,9 @@ def move_nodes(
         pools.valence[hole] = pools.valence[mover]
         pools.valence[mover] = 0
         move_node(mover, hole, carried)
+    if wp.tid() == 0:
+        pools.counts[OLD_TOP] = pools.counts[NODE_TOP]
+        pools.counts[NODE_TOP] = pools.counts[NODE_TOP] - pools.counts[REMOVED]
 
 
 @wp.func
@@ -123,84 +85,32 @@ def present_name(node: int, top: int, old_top: int, moves: Moves):
     return node
 
 
-@wp.func
-def with_present_names(tet: wp.vec4i, top: int, old_top: int, moves: Moves):
-    return wp.vec4i(
-        present_name(tet[0], top, old_top, moves),
-        present_name(tet[1], top, old_top, moves),
-        present_name(tet[2], top, old_top, moves),
-        present_name(tet[3], top, old_top, moves),
-    )
-
-
 @wp.kernel(enable_backward=False)
-def rename_ends(
+def rename_nodes(
     # In
     threads: int,
     moves: Moves,
     # In and out
     pools: Pools,
 ):
-    """Rename ends if a node has moved; nodes that only void tetrahedra name may have ends that moved."""
+    """Write the numbers of moved nodes into tetrahedra of all levels, and into ends; nodes that only void tetrahedra
+    name may have ends that moved."""
     top = pools.counts[NODE_TOP]
     old_top = pools.counts[OLD_TOP]
-    count = top + pools.sink - pools.node_limit
-    if moves.ends[threads - 1] == 0:
-        count = 0
-    for i in range(wp.tid(), count, threads):
-        node = wp.where(i < top, i, pools.node_limit + i - top)
-        ends = pools.ends[node]
-        a = present_name(ends[0], top, old_top, moves)
-        b = present_name(ends[1], top, old_top, moves)
-        if a != ends[0] or b != ends[1]:
-            pools.ends[node] = wp.vec2i(wp.min(a, b), wp.max(a, b))
-
-
-@wp.func
-def rename_upwards(e: int, top: int, old_top: int, pools: Pools, moves: Moves):
-    """Write current numbers into a leaf, and into its ancestors as far as they share a mover with it.
-
-    Threads that meet in an ancestor write the same value, and each continues for its own movers.
-    """
-    before = pools.tets[e]
-    tet = with_present_names(before, top, old_top, moves)
-    moved = int(0)
-    for n in range(4):
-        if tet[n] != before[n]:
-            moved = 1
-    if moved == 1:
-        pools.tets[e] = tet
-        above = pools.parent[e]
-        while above >= 0:
-            whole = with_present_names(pools.tets[above], top, old_top, moves)
-            names = int(0)
+    others = pools.sink - pools.node_limit
+    if moves.counts[0] == 0:
+        return
+    for e in range(wp.tid(), pools.level.shape[0], threads):
+        if pools.level[e] != UNUSED:
+            tet = pools.tets[e]
             for n in range(4):
-                for m in range(4):
-                    if tet[n] != before[n] and whole[m] == tet[n]:
-                        names = 1
-            if names == 1:
-                pools.tets[above] = whole
-                above = pools.parent[above]
-            else:
-                above = -1
-    return tet
-
-
-@wp.kernel(enable_backward=False)
-def rename_void(
-    # In
-    threads: int,
-    moves: Moves,
-    # In and out
-    pools: Pools,
-):
-    top = pools.counts[NODE_TOP]
-    old_top = pools.counts[OLD_TOP]
-    count = pools.void_count
-    if moves.ends[threads - 1] == 0:
-        count = 0
-    for i in range(wp.tid(), count, threads):
-        rename_upwards(pools.void_leaves[i], top, old_top, pools, moves)
+                tet[n] = present_name(tet[n], top, old_top, moves)
+            pools.tets[e] = tet
+    for i in range(wp.tid(), top + others, threads):
+        node = wp.where(i < top, i, pools.node_limit + i - top)
+        a = present_name(pools.ends[node][0], top, old_top, moves)
+        b = present_name(pools.ends[node][1], top, old_top, moves)
+        pools.ends[node] = wp.vec2i(wp.min(a, b), wp.max(a, b))
 
 
 @wp.func
@@ -279,30 +189,17 @@ def list_leaves(
 def adopt_list(
     # In
     threads: int,
-    moves: Moves,
     # In and out
     pools: Pools,
 ):
-    """Replace the old list by the new one, with new numbers for nodes that have moved."""
+    """Replace the old list by the new one."""
     new = pools.counts[NEW_LEAVES]
-    top = pools.counts[NODE_TOP]
-    old_top = pools.counts[OLD_TOP]
     count = wp.max(new, pools.counts[LEAVES])
     if pools.counts[ADDED] + pools.counts[REMOVED] == 0:
         count = 0
     for i in range(wp.tid(), count, threads):
         if i < new:
-            e = pools.new_leaves[i]
-            pools.leaves[i] = e
-            pools.leaf_tets[i] = rename_upwards(e, top, old_top, pools, moves)
+            pools.leaves[i] = pools.new_leaves[i]
+            pools.leaf_tets[i] = pools.tets[pools.new_leaves[i]]
         else:
             pools.leaf_tets[i] = padding(i, pools)
-
-
-@wp.kernel(enable_backward=False)
-def adopt_count(
-    # In and out
-    pools: Pools,
-):
-    if pools.counts[ADDED] + pools.counts[REMOVED] > 0:
-        pools.counts[LEAVES] = pools.counts[NEW_LEAVES]

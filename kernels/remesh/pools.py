@@ -49,8 +49,7 @@ REMOVED = wp.constant(18)  # nodes removed in this pass
 FULL = wp.constant(19)  # nonzero if a refinement was left out because the pools were full
 OLD_TOP = wp.constant(20)  # NODE_TOP before nodes moved into the places of removed ones
 NEW_LEAVES = wp.constant(21)
-FIRST_NEW = wp.constant(22)  # nodes made in this pass have this number or a higher one, until nodes are removed
-COUNTS = 23
+COUNTS = 22
 
 #: Places past the last possible leaf, for launches that are larger than needed.
 LEAF_PADDING = 1024
@@ -83,8 +82,6 @@ class Pools:
     next: wp.array[wp.int32]  # the next tetrahedron around the same edge, during bisection or merging
     free_pairs: wp.array[wp.int32]  # first children
     fresh: wp.array[wp.int32]  # first children made in this pass
-    void_leaves: wp.array[wp.int32]  # void tetrahedra with a node that leaves name
-    void_count: int
     # All possible frames of tetrahedra, and the codes without level of the two children of a
     # tetrahedron by its own frame and type.
     frames: wp.array[wp.mat33]
@@ -127,21 +124,11 @@ def begin_pass(
     counts[NODES_GIVEN] = 0
     counts[PAIRS_GIVEN] = 0
     counts[GAINERS] = 0
+    counts[NODES_TAKEN] = 0
+    counts[PAIRS_TAKEN] = 0
     if goes_on == 0:
         counts[ADDED] = 0
     counts[REMOVED] = 0
-    counts[FIRST_NEW] = counts[NODE_TOP]
-
-
-@wp.kernel(enable_backward=False)
-def give_back(
-    # In and out
-    pools: Pools,
-):
-    """Add removed items to the free ones."""
-    counts = pools.counts
-    counts[FREE_PAIRS] = counts[FREE_PAIRS] + counts[PAIRS_GIVEN]
-    counts[REMOVED] = counts[NODES_GIVEN]
 
 
 # Rows of keyframes for nodes that follow none, and for held nodes between nodes with different rows.
@@ -384,7 +371,11 @@ def settle_ends(
     # In and out
     carried: Carried,
 ):
-    """Update velocities of nodes that gained mass. For held nodes, the supports take the impulse."""
+    """Update velocities of nodes that gained mass; for held nodes, the supports take the impulse. Add what was removed
+    to what is free."""
+    if wp.tid() == 0:
+        pools.counts[FREE_PAIRS] = pools.counts[FREE_PAIRS] + pools.counts[PAIRS_GIVEN]
+        pools.counts[REMOVED] = pools.counts[NODES_GIVEN]
     for i in range(wp.tid(), pools.counts[GAINERS], threads):
         end = carried.gainers[i]
         momentum = carried.gained_momentum[end]

@@ -3,10 +3,7 @@
 An edge is bisected once it is the refinement edge of all leaves around it. If a leaf has a wanted edge that is
 not its refinement edge, its refinement edge becomes wanted, too. So requests spread outwards to ever larger leaves,
 bisection comes back inwards, and each bisection leaves the mesh conforming: it may stop at any time, for example when
-the pools are full.
-
-Consecutive leaves in tree order are close in space, so a node is named in only a few blocks of the list, and a round
-visits only the blocks that contain a wanted edge."""
+the pools are full."""
 
 import warp as wp
 
@@ -15,7 +12,6 @@ from warp_corot.kernels.meshing.growth import EMPTY, LIVE, claim_slot, edge_key,
 from warp_corot.kernels.remesh.pools import (
     ADDED,
     BIRTHS,
-    FIRST_NEW,
     FREE_PAIRS,
     FRESH,
     FRESH_NEW,
@@ -23,11 +19,13 @@ from warp_corot.kernels.remesh.pools import (
     FULL,
     LAST_BIRTHS,
     LEAVES,
+    NEW_LEAVES,
     NODE_TOP,
     NODES_TAKEN,
     PAIRS_TAKEN,
     PASS_STAMP,
     REFINE,
+    REMOVED,
     STAMP,
     WANTED,
     Carried,
@@ -39,107 +37,6 @@ from warp_corot.kernels.remesh.pools import (
 from warp_corot.kernels.tables.shapes import FIRST_NODE, FRAME_SHIFT, SECOND_NODE
 
 wp.set_module_options({"enable_backward": False})
-
-#: Leaves in a block, and those that one thread visits.
-BLOCK = wp.constant(512)
-STRETCH = wp.constant(16)
-#: Number of blocks that are kept for a node. For a node in more blocks, the last entry says so.
-KEPT = 8
-LAST = wp.constant(KEPT - 1)
-NONE = wp.constant(-1)
-MORE = wp.constant(-2)
-
-
-@wp.struct
-class Blocks:
-    """The blocks that name each node, in the list at the beginning of the pass."""
-
-    of_node: wp.array2d[wp.int32]  # [nodes, KEPT]
-    latest: wp.array[wp.int32]
-    hot: wp.array[wp.int32]  # the last round in which an edge in the block became wanted
-    all_hot: wp.array[wp.int32]  # [1] the same for an edge whose blocks are not known
-
-
-@wp.func
-def add_block(node: int, block: int, blocks: Blocks):
-    # Usually it is the one that was added last.
-    if blocks.latest[node] == block:
-        return
-    blocks.latest[node] = block
-    for n in range(LAST):
-        before = wp.atomic_cas(blocks.of_node, node, n, NONE, block)
-        if before == NONE or before == block:
-            return
-    blocks.of_node[node, LAST] = MORE
-
-
-@wp.kernel(enable_backward=False)
-def clear_blocks(
-    # In
-    threads: int,
-    pools: Pools,
-    # Out
-    blocks: Blocks,
-):
-    count = pools.counts[NODE_TOP]
-    if pools.counts[BIRTHS] == 0:
-        count = 0
-    for i in range(wp.tid(), count, threads):
-        blocks.latest[i] = NONE
-        for n in range(KEPT):
-            blocks.of_node[i, n] = NONE
-
-
-@wp.kernel(enable_backward=False)
-def list_blocks(
-    # In
-    threads: int,
-    pools: Pools,
-    # In and out
-    blocks: Blocks,
-):
-    """List the blocks of nodes, if any edge is wanted."""
-    count = pools.counts[LEAVES]
-    if pools.counts[BIRTHS] == 0:
-        count = 0
-    for i in range(wp.tid(), count, threads):
-        tet = pools.leaf_tets[i]
-        for n in range(4):
-            add_block(tet[n], i // BLOCK, blocks)
-
-
-@wp.func
-def heat_blocks(a: int, b: int, stamp: int, first_new: int, blocks: Blocks):
-    """Mark the blocks that name both ends of an edge; nodes made in this pass are in none."""
-    if a >= first_new or b >= first_new:
-        return
-    more_a = blocks.of_node[a, LAST] == MORE
-    more_b = blocks.of_node[b, LAST] == MORE
-    if more_a and more_b:
-        blocks.all_hot[0] = stamp
-        return
-    one = int(a)
-    other = int(b)
-    if more_a:
-        one = b
-        other = a
-    for n in range(LAST):
-        block = blocks.of_node[one, n]
-        if block != NONE:
-            found = more_a or more_b
-            for m in range(LAST):
-                if blocks.of_node[other, m] == block:
-                    found = True
-            if found:
-                blocks.hot[block] = stamp
-
-
-@wp.func
-def is_hot(i: int, pools: Pools, blocks: Blocks):
-    """Whether an edge in the i-th leaf's block became wanted in the last round, or in this one."""
-    since = pools.counts[STAMP] - 1
-    return blocks.hot[i // BLOCK] >= since or blocks.all_hot[0] >= since
-
 
 NEVER = wp.constant(0x7FFFFFFF)
 LOW_HALF = wp.constant(wp.int64((1 << 32) - 1))
@@ -162,11 +59,10 @@ class WantedEdges:
 
 @wp.func
 def want_edge(a: int, b: int, pools: Pools, edges: WantedEdges):
-    """Want an edge; returns whether it is new. Beyond the maximum it is left out: that loses a refinement, never
-    conformity."""
+    """Want an edge. Beyond the maximum it is left out: that loses a refinement, never conformity."""
     if pools.counts[WANTED] >= edges.most:
         wp.atomic_max(pools.counts, FULL, 1)
-        return False
+        return
     slot = claim_slot(edge_key(a, b), edges.keys)
     if slot < 0:
         slot = -slot - 1
@@ -175,8 +71,6 @@ def want_edge(a: int, b: int, pools: Pools, edges: WantedEdges):
         pools.touched[b] = pools.counts[STAMP]
         edges.wanted[wp.atomic_add(pools.counts, WANTED, 1)] = slot
         wp.atomic_add(pools.counts, BIRTHS, 1)
-        return True
-    return False
 
 
 @wp.kernel(enable_backward=False)
@@ -197,42 +91,8 @@ def want_marked(
                 want_edge(tet[0], tet[refinement_end(level)], pools, edges)
 
 
-@wp.kernel(enable_backward=False)
-def heat_wanted(
-    # In
-    threads: int,
-    pools: Pools,
-    edges: WantedEdges,
-    # In and out
-    blocks: Blocks,
-):
-    """Mark blocks with the first wanted edges, once it is known which blocks name which nodes."""
-    for i in range(wp.tid(), pools.counts[WANTED], threads):
-        key = edges.keys[edges.wanted[i]]
-        a = int(key >> wp.int64(32))
-        b = int(key & LOW_HALF)
-        heat_blocks(a, b, pools.counts[STAMP], pools.counts[FIRST_NEW], blocks)
-
-
-@wp.kernel(enable_backward=False)
-def begin_round(
-    # In and out
-    pools: Pools,
-    demand: wp.array[wp.int64],
-):
-    counts = pools.counts
-    counts[STAMP] = counts[STAMP] + 1
-    counts[LAST_BIRTHS] = counts[BIRTHS]
-    counts[BIRTHS] = 0
-    counts[FRESH_SEEN] = counts[FRESH_NEW]
-    counts[FRESH_NEW] = counts[FRESH]
-    counts[NODES_TAKEN] = 0
-    counts[PAIRS_TAKEN] = 0
-    demand[0] = wp.int64(0)
-
-
 @wp.func
-def count_at_edges(e: int, tet: wp.vec4i, is_new: bool, pools: Pools, edges: WantedEdges, blocks: Blocks):
+def count_at_edges(e: int, tet: wp.vec4i, is_new: bool, pools: Pools, edges: WantedEdges):
     """Count a leaf at its wanted edges, each once: an old leaf at those of the last round, a new one at all."""
     stamp = pools.counts[STAMP]
     since = stamp - 1
@@ -254,25 +114,8 @@ def count_at_edges(e: int, tet: wp.vec4i, is_new: bool, pools: Pools, edges: Wan
                         wp.atomic_add(edges.agreed, slot, 1)
                     else:
                         hangs = 1
-    if hangs == 1 and want_edge(tet[0], tet[end], pools, edges):
-        heat_blocks(tet[0], tet[end], stamp, pools.counts[FIRST_NEW], blocks)
-
-
-@wp.func
-def visit_leaf(i: int, pools: Pools, edges: WantedEdges, blocks: Blocks):
-    """Count a leaf at new wanted edges, if it has two recently touched nodes: often three nodes rule it out."""
-    tet = pools.leaf_tets[i]
-    since = pools.counts[STAMP] - 1
-    near = int(0)
-    for n in range(3):
-        if pools.touched[tet[n]] >= since:
-            near += 1
-    if near == 1 and pools.touched[tet[3]] >= since:
-        near = 2
-    if near >= 2:
-        e = pools.leaves[i]
-        if pools.first_child[e] == LIVE:
-            count_at_edges(e, tet, False, pools, edges, blocks)
+    if hangs == 1:
+        want_edge(tet[0], tet[end], pools, edges)
 
 
 @wp.kernel(enable_backward=False)
@@ -282,17 +125,23 @@ def visit_leaves(
     # In and out
     pools: Pools,
     edges: WantedEdges,
-    blocks: Blocks,
 ):
-    """Visit the leaves from before the pass, if there is a new edge to count at."""
-    count = (pools.counts[LEAVES] + STRETCH - 1) // STRETCH
-    if pools.counts[LAST_BIRTHS] == 0:
-        count = 0
-    for stretch in range(wp.tid(), count, threads):
-        first = stretch * STRETCH
-        if is_hot(first, pools, blocks):
-            for i in range(first, wp.min(first + STRETCH, pools.counts[LEAVES])):
-                visit_leaf(i, pools, edges, blocks)
+    """Count the leaves from before the pass at new wanted edges, if there are any: those with two recently touched
+    nodes, which often three nodes rule out."""
+    count = wp.where(pools.counts[LAST_BIRTHS] > 0, pools.counts[LEAVES], 0)
+    since = pools.counts[STAMP] - 1
+    for i in range(wp.tid(), count, threads):
+        tet = pools.leaf_tets[i]
+        near = int(0)
+        for n in range(3):
+            if pools.touched[tet[n]] >= since:
+                near += 1
+        if near == 1 and pools.touched[tet[3]] >= since:
+            near = 2
+        if near >= 2:
+            e = pools.leaves[i]
+            if pools.first_child[e] == LIVE:
+                count_at_edges(e, tet, False, pools, edges)
 
 
 @wp.kernel(enable_backward=False)
@@ -302,31 +151,12 @@ def visit_fresh(
     # In and out
     pools: Pools,
     edges: WantedEdges,
-    blocks: Blocks,
 ):
     """Visit the leaves that this pass made."""
     for i in range(wp.tid(), 2 * pools.counts[FRESH_NEW], threads):
         e = pools.fresh[i // 2] + i % 2
         if pools.first_child[e] == LIVE:
-            count_at_edges(e, pools.tets[e], i // 2 >= pools.counts[FRESH_SEEN], pools, edges, blocks)
-
-
-@wp.kernel(enable_backward=False)
-def clear_edges(
-    # In
-    threads: int,
-    pools: Pools,
-    # In and out
-    edges: WantedEdges,
-):
-    for i in range(wp.tid(), pools.counts[WANTED], threads):
-        slot = edges.wanted[i]
-        edges.keys[slot] = EMPTY
-        edges.born[slot] = NEVER
-        edges.ring[slot] = 0
-        edges.agreed[slot] = 0
-        edges.head[slot] = -1
-        edges.node[slot] = -1
+            count_at_edges(e, pools.tets[e], i // 2 >= pools.counts[FRESH_SEEN], pools, edges)
 
 
 # The upper half of ``demand`` counts nodes, the lower half pairs.
@@ -466,24 +296,49 @@ def bisect_edges(
 
 
 @wp.kernel(enable_backward=False)
-def end_round(
+def next_round(
     # In and out
     pools: Pools,
+    demand: wp.array[wp.int64],
     # Out
     goes_on: wp.array[wp.int32],
 ):
+    """End a round, if there was one, and begin the next."""
     counts = pools.counts
     counts[NODE_TOP] = counts[NODE_TOP] + counts[NODES_TAKEN]
     counts[FREE_PAIRS] = counts[FREE_PAIRS] - counts[PAIRS_TAKEN]
     counts[ADDED] = counts[ADDED] + counts[NODES_TAKEN]
     goes_on[0] = wp.where(counts[BIRTHS] + counts[NODES_TAKEN] > 0, 1, 0)
+    counts[STAMP] = counts[STAMP] + 1
+    counts[LAST_BIRTHS] = counts[BIRTHS]
+    counts[BIRTHS] = 0
+    counts[FRESH_SEEN] = counts[FRESH_NEW]
+    counts[FRESH_NEW] = counts[FRESH]
+    counts[NODES_TAKEN] = 0
+    counts[PAIRS_TAKEN] = 0
+    demand[0] = wp.int64(0)
 
 
 @wp.kernel(enable_backward=False)
-def begin_rounds(
+def end_pass(
     # In
+    threads: int,
+    # In and out
     pools: Pools,
-    # Out
-    goes_on: wp.array[wp.int32],
+    edges: WantedEdges,
+    moved: wp.array[wp.int32],
 ):
-    goes_on[0] = wp.where(pools.counts[BIRTHS] > 0, 1, 0)
+    """Clear the table of edges and the counts of moved nodes, and adopt the number of leaves."""
+    for i in range(wp.tid(), pools.counts[WANTED], threads):
+        slot = edges.wanted[i]
+        edges.keys[slot] = EMPTY
+        edges.born[slot] = NEVER
+        edges.ring[slot] = 0
+        edges.agreed[slot] = 0
+        edges.head[slot] = -1
+        edges.node[slot] = -1
+    if wp.tid() == 0:
+        moved[0] = 0
+        moved[1] = 0
+        if pools.counts[ADDED] + pools.counts[REMOVED] > 0:
+            pools.counts[LEAVES] = pools.counts[NEW_LEAVES]

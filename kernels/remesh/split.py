@@ -16,7 +16,7 @@ from warp_corot.kernels.elements.elements import load_node, store_node
 from warp_corot.kernels.meshing.bisection import refinement_end
 from warp_corot.kernels.plan.plan import TORN
 
-from .cut import COPIES, MARKED, STAMP, STARS, Cuts, add_star, face_node, forget, is_cut, meet, star_count
+from .cut import COPIES, MARKED, STAMP, Cuts, add_star, face_node, forget, is_cut, meet, star_count
 from .pools import ADDED, FULL, LEAVES, NODE_TOP, Carried, Pools, copy_node, quarter_mass, refresh_mass
 
 wp.set_module_options({"enable_backward": False})
@@ -45,14 +45,6 @@ def unite(a: int, b: int, cuts: Cuts):
             return
         low = root_of(low, cuts)
         high = root_of(before, cuts)
-
-
-@wp.kernel(enable_backward=False)
-def begin_stars(
-    # In and out
-    cuts: Cuts,
-):
-    cuts.counts[STARS] = 0
 
 
 @wp.kernel(enable_backward=False)

@@ -19,7 +19,7 @@ from warp_corot.discretization.elements import (
     parts,
     with_targets,
 )
-from warp_corot.discretization.levels import Levels, TreeNodes
+from warp_corot.discretization.levels import Levels
 from warp_corot.discretization.plan import Awaited, Plan, Slots
 from warp_corot.discretization.planner import ForcePlan, pays_in_groups, units_of
 from warp_corot.discretization.sizes import Clock, Sizes
@@ -116,12 +116,12 @@ class Discretization(ABC):
             InputError: The mesh is a general one, which has no tree.
         """
         if self._levels is None or self._levels.version != self.sizes.version:
-            self._levels = Levels(self._tree_nodes(), self.sizes)
+            self._levels = Levels(*self._tree_nodes(), self.sizes, self.device)
         return self._levels
 
     @abstractmethod
-    def _tree_nodes(self) -> TreeNodes:
-        """The nodes of the tree on the device; see ``levels``."""
+    def _tree_nodes(self) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.int32], int]:
+        """The lattice points, ends, and first node of no leaf that ``Levels`` takes."""
 
     @abstractmethod
     def anisotropic_material(self) -> OrthotropicMaterial:
@@ -281,8 +281,11 @@ class FixedMesh(Discretization):
             elements = with_targets(elements, wp.array(targets, dtype=wp.vec4i, device=device))
         return ForcePlan.leaf_by_leaf(elements, slots, find_units)
 
-    def _tree_nodes(self) -> TreeNodes:
-        return TreeNodes.of_mesh(self._mesh, self.device)
+    def _tree_nodes(self) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.int32], int]:
+        mesh = self._mesh
+        if not isinstance(mesh, TetForest):
+            raise InputError(f"only a TetForest has levels; this mesh is a {type(mesh).__name__}, which has no tree")
+        return mesh.lattice, mesh.node_ends, mesh.node_count
 
     def anisotropic_material(self) -> OrthotropicMaterial:
         given, fill = self._material, self.fill

@@ -1,61 +1,35 @@
-"""The nodes of a forest by tree level.
+"""The nodes of a forest by tree level, found only from their lattice points.
 
 The mesh of level l is all tetrahedra of level l that have leaves below them or are leaves, and all leaves above that
 level. Every node but a root's corner is the midpoint of an edge of the next coarser level, so a function that is linear
 in each tetrahedron of a level is, at the nodes that the next level adds, the mean of two values.
+
+Let t be the smallest number of trailing zero bits of the nonzero coordinates of a node's lattice point. Three levels
+halve the edges, and within three the first midpoints are those of a cube's diagonals, then of its faces' diagonals,
+then of its edges: on one, two or all three axes the point is odd in units of 2^t. So t and the number of these axes
+give the level.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
-
 import numpy as np
+import numpy.typing as npt
 import warp as wp
 
-from warp_corot.errors import InputError
-from warp_corot.kernels.meshing.growth import gather_flagged
-from warp_corot.kernels.plan import levels as kernels
-from warp_corot.mesh import TetForest
 from warp_corot.mesh.lattice import LATTICE_BITS, MAX_LEVEL
 
-from .elements import Mesh
 from .sizes import Sizes
 
-#: Bits of a level in a key.
-LEVEL_BITS = MAX_LEVEL.bit_length()
+Ints = npt.NDArray[np.int32]
 
 
-@dataclass(frozen=True, eq=False)
-class TreeNodes:
-    """The nodes of a forest in the mesh's numbering: nodes of leaves are 0 … N - 1.
-
-    Attributes:
-        lattice: Lattice points, vec3i.
-        ends: The two ends of the edge whose midpoint each node is, vec2i; -1, -1 for corners of roots.
-        mesh_nodes: N.
-        first_other: The first node of no leaf.
-        other_count: Number of nodes of no leaf.
-    """
-
-    lattice: wp.array
-    ends: wp.array
-    mesh_nodes: int
-    first_other: int
-    other_count: int
-
-    @classmethod
-    def of_mesh(cls, mesh: Mesh, device: wp.Device) -> TreeNodes:
-        """The levels of a mesh on the host.
-
-        Raises:
-            InputError: A general mesh.
-        """
-        if not isinstance(mesh, TetForest):
-            raise InputError(f"only a TetForest has levels; this mesh is a {type(mesh).__name__}, which has no tree")
-        count, total = mesh.node_count, len(mesh.lattice)
-        lattice = wp.array(mesh.lattice, dtype=wp.vec3i, device=device)
-        return cls(lattice, wp.array(mesh.node_ends, dtype=wp.vec2i, device=device), count, count, total - count)
+def level_of_points(lattice: Ints) -> npt.NDArray[np.int8]:
+    """The level of the node at each lattice point [n, 3], 0 for corners of roots."""
+    together = np.bitwise_or.reduce(lattice, axis=1)
+    lowest = together & -together
+    odd = np.count_nonzero(lattice & lowest[:, None], axis=1)
+    level = MAX_LEVEL + 1 - odd - 3 * np.bitwise_count(np.maximum(lowest, 1) - 1).astype(np.int64)
+    return np.where((lowest == 0) | (lowest >= 1 << LATTICE_BITS), 0, level).astype(np.int8)
 
 
 class Levels:
@@ -68,8 +42,12 @@ class Levels:
     the nodes up to a level.
 
     Args:
-        tree: The nodes.
-        sizes: The number of worlds.
+        lattice: Lattice points of the N nodes of leaves, and of all nodes of no leaf, int32 [n, 3].
+        ends: The two ends of the edge whose midpoint each of them is, in the mesh's own numbering, int32 [n, 2];
+            -1, -1 for corners of roots.
+        first_other: The number of the first node of no leaf there.
+        sizes: The numbers of nodes and worlds.
+        device: Where the arrays are.
 
     Attributes:
         version: ``sizes.version`` of the mesh whose levels these are.
@@ -84,56 +62,28 @@ class Levels:
         ends: Both ends of each node's edge, vec2i [M], in the order of ``nodes``; -1, -1 for corners of roots.
     """
 
-    def __init__(self, tree: TreeNodes, sizes: Sizes):
-        self.device, self.worlds, self.version = tree.lattice.device, sizes.worlds, sizes.version
-        self.mesh_nodes = tree.mesh_nodes
-        self.others, numbers = self._find_others(tree)
-        self.node_count = tree.mesh_nodes + len(self.others)
-        self._sort_nodes(tree)
-        self.ends = wp.empty(self.node_count, dtype=wp.vec2i, device=self.device)
-        inputs = [tree.mesh_nodes, self.starts[1], tree.first_other, tree.ends, numbers, self.others, self.nodes]
-        self._launch(kernels.list_ends, self.node_count, inputs, [self.ends])
+    def __init__(self, lattice: Ints, ends: Ints, first_other: int, sizes: Sizes, device: wp.Device):
+        self.device, self.worlds, self.version = device, sizes.worlds, sizes.version
+        self.mesh_nodes = count = sizes.world_nodes
+        ends = np.where(ends < first_other, ends, ends - (first_other - count))
+        # Nodes of no leaf that are ends of the others, and so on upwards.
+        named = np.arange(len(lattice)) < count
+        found = ends[:count]
+        while len(found := np.unique(found[found >= count])):
+            found = found[~named[found]]
+            named[found] = True
+            found = ends[found]
+        place = np.flatnonzero(named)
+        number = np.cumsum(named, dtype=np.int32) - 1
+        level = level_of_points(lattice[place])
+        order = np.argsort(level, kind="stable")
+        self.node_count, self.depth = len(place), int(level.max())
+        self.starts = (0, *np.cumsum(np.bincount(level)).tolist())
+        of_nodes = number[ends[place[order]]]
+        of_nodes[: self.starts[1]] = -1
+        self.others = wp.array(place[count:] + (first_other - count), dtype=wp.int32, device=device)
+        self.nodes = wp.array(order, dtype=wp.int32, device=device)
+        self.ends = wp.array(of_nodes, dtype=wp.vec2i, device=device)
 
     def __repr__(self) -> str:
         return f"Levels({self.node_count} nodes of levels 0 to {self.depth} on {self.device})"
-
-    # --- pieces ------------------------------------------------------------------------------------------------------
-
-    def _find_others(self, tree: TreeNodes) -> tuple[wp.array, wp.array]:
-        """Places of the nodes that are ends of others but belong to no leaf, and the inclusive sum of flags of these
-        places.
-        """
-        flags, sums = self._ints(tree.other_count), self._ints(tree.other_count)
-        if tree.other_count == 0:
-            return flags, sums
-        flags.zero_()
-        inputs = [LATTICE_BITS, tree.first_other, tree.lattice, tree.ends]
-        self._launch(kernels.flag_ends, tree.mesh_nodes, [0, -1, *inputs], [flags])
-        for level in range(MAX_LEVEL, 0, -1):
-            self._launch(kernels.flag_ends, tree.other_count, [tree.first_other, level, *inputs], [flags])
-        wp.utils.array_scan(flags, sums, inclusive=True)
-        places = self._ints(int(sums[-1:].numpy()[0]))
-        self._launch(gather_flagged, tree.other_count, [flags, sums, tree.first_other], [places])
-        return places, sums
-
-    def _sort_nodes(self, tree: TreeNodes) -> None:
-        """Find the order of the nodes and the beginnings of levels."""
-        count = self.node_count
-        # Sorting needs twice the room.
-        level, nodes = self._ints(2 * count), self._ints(2 * count)
-        inputs = [tree.mesh_nodes, LATTICE_BITS, tree.lattice, self.others]
-        self._launch(kernels.find_levels, count, inputs, [level, nodes])
-        wp.utils.radix_sort_pairs(level, nodes, count, end_bit=LEVEL_BITS)
-        self.nodes = self._ints(count)
-        wp.copy(self.nodes, nodes, count=count)
-        starts = self._ints(MAX_LEVEL + 2)
-        self._launch(kernels.find_starts, len(starts), [count, level], [starts])
-        found = starts.numpy()
-        self.depth = int(np.flatnonzero(found < count)[-1])
-        self.starts = tuple(found[: self.depth + 2].tolist())
-
-    def _ints(self, count: int) -> wp.array:
-        return wp.empty(count, dtype=wp.int32, device=self.device)
-
-    def _launch(self, kernel: wp.Kernel, dim: int, inputs: list[Any], outputs: list[Any]) -> None:
-        wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from enum import Enum
-from typing import Protocol
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -20,7 +20,14 @@ from warp_corot.discretization.elements import Elements, in_worlds
 from warp_corot.errors import InputError
 from warp_corot.inputs.cpu_threads import launch, part_of
 from warp_corot.kernels.elements.elements import GeneralElements, Subtrees, gather_slots
-from warp_corot.kernels.plan.slots import find_starts, number_slots, order_slots
+from warp_corot.kernels.plan.slots import find_starts, order_slots
+
+if TYPE_CHECKING:
+    from .changing.plan import DevicePlan
+    from .planner import ForcePlan
+
+#: The units of work of a force field, for a mesh that never changes, or one that does.
+Plan: TypeAlias = "ForcePlan | DevicePlan"
 
 #: Slots are numbered in 32 bits.
 MOST_SLOTS = 2**31 - 1
@@ -54,8 +61,7 @@ class Slots:
             node_count: Number of nodes of one world.
         """
         device = nodes.device
-        slots = wp.empty_like(nodes)
-        wp.launch(number_slots, per_world, outputs=[slots], device=device)
+        slots = wp.array(np.arange(len(nodes)), dtype=wp.int32, device=device)
         wp.utils.radix_sort_pairs(nodes, slots, per_world)
         starts = wp.empty(worlds * node_count + 1, dtype=wp.int32, device=device)
         inputs = [per_world, node_count, used, nodes]
@@ -167,13 +173,8 @@ def chosen(values: wp.array, places: wp.array) -> wp.array:
 
 # --- the plan --------------------------------------------------------------------------------------------------------
 #
-# The force plan: complete subtrees in batches of one type, and the remaining leaves.
-#
 # Meshing edits the tree. The plan is derived from the tree on the device, and steps read only the plan. It is derived
 # once if the mesh never changes (``planner``), otherwise after each pass (``changing.plan``).
-
-
-__all__ = ["Batch", "FlatLeaves", "LeafCounts", "Plan", "Sharing", "Units"]
 
 
 @dataclass(frozen=True)
@@ -230,49 +231,6 @@ class LeafCounts:
     before: wp.array
     goes: wp.array
     threads: int
-
-
-class Plan(Protocol):
-    """The units of work of a force field, for any mesh.
-
-    Attributes:
-        elements: All leaves, ``ForestElements`` or, of a general mesh, ``GeneralElements`` of ``kernels.elements``;
-            their forces go to the slots if there are any.
-        batches: Subtrees by type, grouped or not, and sharing; none if the field computes leaf by leaf.
-        flat: The other leaves.
-        slots: The places to which kernels first add forces if sums must have a fixed order, else None.
-        counts: The number of leaves, if it changes, else None.
-    """
-
-    @property
-    def elements(self) -> Elements: ...
-
-    @property
-    def batches(self) -> tuple[Batch, ...]: ...
-
-    @property
-    def flat(self) -> FlatLeaves: ...
-
-    @property
-    def units(self) -> Units | None:
-        """The units, if a batch or a flat leaf uses their rotations, else None."""
-        ...
-
-    @property
-    def all_units(self) -> Units:
-        """The units, also if no launch of forces uses them; only if rotations are shared."""
-        ...
-
-    @property
-    def kinds(self) -> list[tuple[int, bool, Sharing]]:
-        """Shape, whether in groups, and sharing of all possible batches."""
-        ...
-
-    @property
-    def slots(self) -> Slots | None: ...
-
-    @property
-    def counts(self) -> LeafCounts | None: ...
 
 
 # --- nodes whose displacements arrive during a step ------------------------------------------------------------------

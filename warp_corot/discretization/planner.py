@@ -6,7 +6,7 @@ import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import TYPE_CHECKING, Any, NamedTuple, cast
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -19,7 +19,6 @@ from warp_corot.kernels.elements.cpu import rest_matrices
 from warp_corot.kernels.elements.elements import ForestElements, GeneralElements, Subtrees
 from warp_corot.kernels.plan import batches as batch_kernels
 from warp_corot.kernels.plan import lists
-from warp_corot.kernels.plan import lists as unit_kernels
 from warp_corot.kernels.plan import slots as kernels
 from warp_corot.kernels.plan.plan import Plan, Tree, places_t
 from warp_corot.kernels.tables.shapes import MIRROR_BIT
@@ -28,9 +27,6 @@ from warp_corot.mesh import TetForest
 from warp_corot.mesh.bisection import corner_leaves
 from warp_corot.mesh.lattice import MAX_LEVEL
 from warp_corot.mesh.tree import UniformTree
-
-if TYPE_CHECKING:
-    from warp_corot.kernels.elements.elements import ForestElements
 
 
 def tree_of(forest: TetForest, elements: ForestElements, rotation_level: int | None) -> Tree:
@@ -133,8 +129,17 @@ class Room:
     leaves: int
 
 
+#: Threads of a launch on CUDA for each multiprocessor.
+THREADS_PER_PROCESSOR = 1024
+
+
+def threads_on(device: wp.Device) -> int:
+    """Number of threads of a launch in which each loops over a stretch of leaves."""
+    return 1 if device.is_cpu else device.sm_count * THREADS_PER_PROCESSOR
+
+
 class PlanArrays:
-    """The arrays of a plan, at first without values.
+    """The arrays of a plan, at first without values, and the launches that derive it, which may be recorded.
 
     Args:
         tree: The tree that the plan is derived from.
@@ -142,6 +147,7 @@ class PlanArrays:
         rotation_level: Level of the tree at which rotations are shared; None: not shared.
         subtrees: False: all leaves are computed one by one.
         grouped: Whether complete subtrees form groups where possible.
+        threads: Threads of a launch.
 
     Attributes:
         kinds: Sharing and shape of the subtrees of one launch, grouped or not.
@@ -150,7 +156,14 @@ class PlanArrays:
     """
 
     def __init__(
-        self, tree: Tree, elements: ForestElements, rotation_level: int | None, *, subtrees: bool, grouped: bool
+        self,
+        tree: Tree,
+        elements: ForestElements,
+        rotation_level: int | None,
+        threads: int,
+        *,
+        subtrees: bool,
+        grouped: bool,
     ):
         self.tree, self._elements_like = tree, elements
         self.device = elements.nodes.device
@@ -164,6 +177,8 @@ class PlanArrays:
         plan.counts, plan.before = self._zeros(plan.classes + 3), self._zeros(plan.classes + 3)
         plan.code = elements.code
         self.plan, self.batches, self.leaves = plan, batch_kernels.Batches(), batch_kernels.FlatLeaves()
+        self._threads, self._rows = threads, plan.classes + 2
+        self._sums, self._ends = self._empty(self._rows * threads), self._empty(self._rows * threads)
 
     def make(self, room: Room) -> None:
         """Make the arrays.
@@ -209,6 +224,38 @@ class PlanArrays:
     @property
     def rotation_shared(self) -> bool:
         return bool(self.plan.rotation_level >= 0)
+
+    # --- launches ----------------------------------------------------------------------------------------------------
+
+    def find(self) -> None:
+        """Find the leaves in complete subtrees and the units, and count them; this needs only ``plan.marks``."""
+        self._launch(lists.mark_leaves, self._threads, self._threads, self.tree, self.plan, self._sums)
+        wp.utils.array_scan(self._sums, self._ends, inclusive=True)
+        self._launch(lists.count_rows, self._rows, self._threads, self._ends, self.plan)
+
+    def list(self) -> None:
+        """List the leaves and the units."""
+        self._launch(lists.list_leaves, self._threads, self._threads, self.tree, self._ends, self.plan)
+
+    def fill_batches(self) -> None:
+        """Write the data of subtrees for launches."""
+        inputs = self._threads, self.tree, self.plan, self.batches
+        self._launch(batch_kernels.fill_batches, (self.plan.classes, self._threads), *inputs)
+
+    def fill_flat(self) -> None:
+        """Write the data of leaves outside subtrees for launches."""
+        self._launch(batch_kernels.fill_flat, self._threads, self._threads, self.tree, self.plan, self.leaves)
+
+    def pad_units(self) -> None:
+        """Write padding before and after the units."""
+        self._launch(lists.pad_units, self._threads, self._threads, self.tree, self.plan)
+
+    def repeat_units(self) -> None:
+        """Write the units of all worlds but the first."""
+        self._launch(lists.repeat_units, (self.plan.worlds - 1, self.plan.world_leaves), self.plan)
+
+    def _launch(self, kernel: wp.Kernel, dim: int | tuple[int, int], *arguments: Any) -> None:
+        wp.launch(kernel, dim=dim, inputs=list(arguments), device=self.device)
 
     # --- what launches go through ------------------------------------------------------------------------------------
 
@@ -289,72 +336,12 @@ def _first(array: wp.array, count: int, axis: int = 0) -> wp.array:
     return array[:count] if axis == 0 else array[:, :count]
 
 
-# --- the launches that derive a plan ---------------------------------------------------------------------------------
-
-
-#: Threads of a launch on CUDA for each multiprocessor.
-THREADS_PER_PROCESSOR = 1024
-
-
-def threads_on(device: wp.Device) -> int:
-    """Number of threads of a launch in which each loops over a stretch of leaves."""
-    return 1 if device.is_cpu else device.sm_count * THREADS_PER_PROCESSOR
-
-
-class Planner:
-    """Derives a plan, in steps that may be recorded.
-
-    Args:
-        arrays: The plan's arrays; ``find`` needs only ``plan.marks``.
-        threads: Threads of a launch.
-    """
-
-    def __init__(self, arrays: PlanArrays, threads: int):
-        self._arrays, self._threads, self._device = arrays, threads, arrays.device
-        self._rows = arrays.plan.classes + 2
-        self._sums, self._ends = (wp.empty(self._rows * threads, dtype=wp.int32, device=self._device) for _ in range(2))
-
-    def find(self) -> None:
-        """Find the leaves in complete subtrees and the units, and count them."""
-        made, threads = self._arrays, self._threads
-        self._launch(lists.mark_leaves, threads, threads, made.tree, made.plan, self._sums)
-        wp.utils.array_scan(self._sums, self._ends, inclusive=True)
-        self._launch(lists.count_rows, self._rows, threads, self._ends, made.plan)
-
-    def list(self) -> None:
-        """List the leaves and the units."""
-        made, threads = self._arrays, self._threads
-        self._launch(lists.list_leaves, threads, threads, made.tree, self._ends, made.plan)
-
-    def fill_batches(self) -> None:
-        """Write the data of subtrees for launches."""
-        made, threads = self._arrays, self._threads
-        inputs = (threads, made.tree, made.plan, made.batches)
-        self._launch(batch_kernels.fill_batches, (made.plan.classes, threads), *inputs)
-
-    def fill_flat(self) -> None:
-        """Write the data of leaves outside subtrees for launches."""
-        made, threads = self._arrays, self._threads
-        self._launch(batch_kernels.fill_flat, threads, threads, made.tree, made.plan, made.leaves)
-
-    def pad_units(self) -> None:
-        """Write padding before and after the units."""
-        made, threads = self._arrays, self._threads
-        self._launch(unit_kernels.pad_units, threads, threads, made.tree, made.plan)
-
-    def repeat_units(self) -> None:
-        """Write the units of all worlds but the first."""
-        plan = self._arrays.plan
-        self._launch(unit_kernels.repeat_units, (plan.worlds - 1, plan.world_leaves), plan)
-
-    def _launch(self, kernel: wp.Kernel, dim: int | tuple[int, int], *arguments: Any) -> None:
-        wp.launch(kernel, dim=dim, inputs=list(arguments), device=self._device)
-
-
 # --- slots for the forces of a plan's subtrees and single leaves; see ``kernels.plan.slots`` -------------------------
 
 
-class SubtreeTargets:
+def slots_of(
+    made: PlanArrays, subtrees: Sequence[int], flat: int, elements: Elements, worlds: int
+) -> tuple[Slots, wp.array, wp.array]:
     """Slots for the forces of all subtrees, or groups of these, and single leaves.
 
     Args:
@@ -362,51 +349,52 @@ class SubtreeTargets:
         subtrees, flat: Numbers of a world's subtrees of each class, and of its leaves outside subtrees.
         elements: The leaves, in all worlds.
 
-    Attributes:
-        slots: The slots.
-        of_subtrees: The places to which forces of subtrees are added, in the layout of ``made.batches.nodes``.
-        of_leaves: The places to which forces of all leaves are added, vec4i [worlds * T].
+    Returns:
+        The slots; the places to which forces of subtrees are added, in the layout of ``made.batches.nodes``; and those
+        of all leaves, vec4i [worlds * T].
 
     Raises:
         InputError: There are more slots than can be numbered.
     """
-
-    def __init__(self, made: PlanArrays, subtrees: Sequence[int], flat: int, elements: Elements, worlds: int):
-        device, plan = made.device, made.plan
-        begin, unused = [0], 0
-        for row, count in enumerate(subtrees):
-            grouped = made.is_grouped(row)
-            begin.append(begin[-1] + (5 if grouped else 10) * count)
-            if grouped:
-                shape = made.kinds[row // plan.members][1]
-                unused += count // 8 * (GROUP_NODES - len(group_nodes(shape)))
-        per_world = begin[-1] + 4 * flat
-        check_slots(worlds * per_world)
-        tables = places_on(device.alias)
-        targets = kernels.Targets()
-        targets.begin = places_t(*begin, *[0] * (16 - len(begin)))
-        targets.per_world, targets.no_node = per_world, plan.world_nodes
-        targets.leaf_places, targets.group_leaf_places = tables.leaves, tables.group_leaves
-        # The second half is room for sorting.
-        targets.nodes = wp.empty(2 * per_world, dtype=wp.int32, device=device)
-        targets.of_subtrees = wp.empty_like(made.batches.nodes)
-        targets.of_leaves = wp.empty_like(elements.nodes)
-        threads = threads_on(device)
-        if any(subtrees):
-            inputs = [threads, plan, made.batches]
-            wp.launch(kernels.target_subtrees, (plan.classes, threads), inputs, [targets], device=device)
-        if flat:
-            wp.launch(kernels.target_flat, (worlds, flat), [plan, made.tree], [targets], device=device)
-        self.of_subtrees, self.of_leaves = targets.of_subtrees, targets.of_leaves
-        self.slots = Slots.of_nodes(targets.nodes, per_world, per_world - unused, plan.world_nodes, worlds)
+    device, plan = made.device, made.plan
+    begin, unused = [0], 0
+    for row, count in enumerate(subtrees):
+        grouped = made.is_grouped(row)
+        begin.append(begin[-1] + (5 if grouped else 10) * count)
+        if grouped:
+            unused += count // 8 * (GROUP_NODES - len(group_nodes(made.kinds[row // plan.members][1])))
+    per_world = begin[-1] + 4 * flat
+    check_slots(worlds * per_world)
+    tables = places_on(device.alias)
+    targets = kernels.Targets()
+    targets.begin, targets.per_world, targets.no_node = _places(begin), per_world, plan.world_nodes
+    targets.leaf_places, targets.group_leaf_places = tables.leaves, tables.group_leaves
+    # The second half is room for sorting.
+    targets.nodes = wp.empty(2 * per_world, dtype=wp.int32, device=device)
+    targets.of_subtrees, targets.of_leaves = wp.empty_like(made.batches.nodes), wp.empty_like(elements.nodes)
+    threads = threads_on(device)
+    if any(subtrees):
+        inputs = [threads, plan, made.batches]
+        wp.launch(kernels.target_subtrees, (plan.classes, threads), inputs, [targets], device=device)
+    if flat:
+        wp.launch(kernels.target_flat, (worlds, flat), [plan, made.tree], [targets], device=device)
+    slots = Slots.of_nodes(targets.nodes, per_world, per_world - unused, plan.world_nodes, worlds)
+    return slots, targets.of_subtrees, targets.of_leaves
 
 
 @dataclass(frozen=True)
 class ForcePlan:
-    """The ``Plan`` of a mesh that never changes.
+    """The units of work of a force field on a mesh that never changes.
 
     Attributes:
+        elements: All leaves, ``ForestElements`` or, of a general mesh, ``GeneralElements`` of ``kernels.elements``;
+            their forces go to the slots if there are any.
+        batches: Subtrees by type, grouped or not, and sharing; none if the field computes leaf by leaf.
+        flat: The other leaves.
+        units: The units, if a batch or a flat leaf uses their rotations, else None.
+        slots: The places to which kernels first add forces if sums must have a fixed order, else None.
         find_units: A function that makes ``all_units`` for a forest with shared rotations.
+        counts: The number of leaves, if it changes, else None.
     """
 
     elements: Elements
@@ -419,11 +407,13 @@ class ForcePlan:
 
     @cached_property
     def all_units(self) -> Units:
+        """The units, also if no launch of forces uses them; only if rotations are shared."""
         assert self.find_units is not None
         return self.units or self.find_units()
 
     @property
     def kinds(self) -> list[tuple[int, bool, Sharing]]:
+        """Shape, whether in groups, and sharing of all batches."""
         return [(batch.shape, batch.grouped, batch.sharing) for batch in self.batches]
 
     @classmethod
@@ -460,22 +450,23 @@ class ForcePlan:
         """
         if elements is None:
             elements = device_elements(forest, device, worlds)
-        found = _Found(forest, elements, rotation_level, worlds, grouped=device.is_cuda if grouped is None else grouped)
+        grouped = device.is_cuda if grouped is None else grouped
+        made, counts = _counted(forest, elements, rotation_level, worlds, grouped=grouped)
+        *subtrees, flat, units = counts
         find_units = None if rotation_level is None else partial(units_of, forest, elements, rotation_level, worlds)
-        has_units = rotation_level is not None and (found.flat > 0 or found.has_units_above)
-        made = found.made(with_units=has_units)
-        targets = SubtreeTargets(made, found.subtrees, found.flat, elements, worlds) if deterministic else None
-        batches = [
-            made.batch(row, worlds * count, targets and targets.of_subtrees)
-            for row, count in enumerate(found.subtrees)
-            if count
-        ]
+        above = any(n for row, n in enumerate(subtrees) if made.kinds[row // made.plan.members][0] is Sharing.ABOVE)
+        has_units = rotation_level is not None and (flat > 0 or above)
+        _fill(made, counts, with_units=has_units)
+        slots = of_subtrees = None
+        if deterministic:
+            slots, of_subtrees, of_leaves = slots_of(made, subtrees, flat, elements, worlds)
+            elements = with_targets(elements, of_leaves)
         return cls(
-            elements if targets is None else with_targets(elements, targets.of_leaves),
-            tuple(batches),
-            made.flat(worlds * found.flat),
-            made.units(worlds * found.units) if has_units else None,
-            None if targets is None else targets.slots,
+            elements,
+            tuple(made.batch(row, worlds * n, of_subtrees) for row, n in enumerate(subtrees) if n),
+            made.flat(worlds * flat),
+            made.units(worlds * units) if has_units else None,
+            slots,
             find_units,
         )
 
@@ -486,65 +477,49 @@ def units_of(forest: TetForest, elements: Elements, rotation_level: int, worlds:
     Args:
         elements: The forest's leaves, in all worlds.
     """
-    found = _Found(forest, elements, rotation_level, worlds, subtrees=False)
-    return found.made(with_units=True, with_lists=False).units(worlds * found.units)
+    made, counts = _counted(forest, elements, rotation_level, worlds, subtrees=False)
+    _fill(made, counts, with_units=True, with_lists=False)
+    return made.units(worlds * counts[-1])
 
 
 def pays_in_groups(forest: TetForest, elements: Elements, worlds: int) -> bool:
     """Whether enough leaves are in groups to make launches of subtrees faster than one of single elements (CUDA)."""
-    found = _Found(forest, elements, None, worlds, grouped=True)
-    return worlds * 8 * sum(found.subtrees[::2]) >= GROUPED_LEAVES
+    *subtrees, _, _ = _counted(forest, elements, None, worlds, grouped=True)[1]
+    return worlds * 8 * sum(subtrees[::2]) >= GROUPED_LEAVES
 
 
-class _Found:
-    """A world's numbers of subtrees of each class, of leaves outside subtrees, and of units; and the arrays of all of
-    them.
-    """
+def _counted(
+    forest: TetForest,
+    elements: Elements,
+    rotation_level: int | None,
+    worlds: int,
+    *,
+    subtrees: bool = True,
+    grouped: bool = False,
+) -> tuple[PlanArrays, list[int]]:
+    """A plan's arrays, and a world's numbers of subtrees of each class, of leaves outside subtrees, and of units."""
+    device, leaves = elements.nodes.device, cast("ForestElements", elements)
+    tree, threads = tree_of(forest, leaves, rotation_level), min(threads_on(device), len(forest.tets))
+    made = PlanArrays(tree, leaves, rotation_level, threads, subtrees=subtrees, grouped=grouped)
+    plan = made.plan
+    plan.worlds, plan.world_nodes, plan.world_leaves = worlds, len(forest.points), len(forest.tets)
+    plan.marks = wp.empty(plan.world_leaves, dtype=wp.int8, device=device)
+    plan.goes = wp.ones(1, dtype=wp.int32, device=device)
+    made.find()
+    return made, plan.counts.numpy()[:-1].tolist()
 
-    def __init__(
-        self,
-        forest: TetForest,
-        elements: Elements,
-        rotation_level: int | None,
-        worlds: int,
-        *,
-        subtrees: bool = True,
-        grouped: bool = False,
-    ):
-        device, leaves = elements.nodes.device, cast("ForestElements", elements)
-        tree = tree_of(forest, leaves, rotation_level)
-        self._arrays = PlanArrays(tree, leaves, rotation_level, subtrees=subtrees, grouped=grouped)
-        plan = self._arrays.plan
-        plan.worlds, plan.world_nodes, plan.world_leaves = worlds, len(forest.points), len(forest.tets)
-        plan.marks = wp.empty(plan.world_leaves, dtype=wp.int8, device=device)
-        plan.goes = wp.ones(1, dtype=wp.int32, device=device)
-        self._planner = Planner(self._arrays, min(threads_on(device), plan.world_leaves))
-        self._planner.find()
-        *self.subtrees, self.flat, self.units, _ = plan.counts.numpy().tolist()
 
-    @property
-    def has_units_above(self) -> bool:
-        """Whether leaves of some subtree share a rotation further up."""
-        rows = zip(self._arrays.kinds, self._by_kind(), strict=True)
-        return any(count for (sharing, _), count in rows if sharing is Sharing.ABOVE)
-
-    def made(self, *, with_units: bool, with_lists: bool = True) -> PlanArrays:
-        """The arrays of subtrees and of leaves outside them, of units, or of both."""
-        made, plan, planner = self._arrays, self._arrays.plan, self._planner
-        worlds, leaves = plan.worlds, plan.worlds * plan.world_leaves
-        plan.world_units = self.units
-        made.make(
-            Room([worlds * n for n in self.subtrees], worlds * self.flat, worlds * self.units * with_units, leaves)
-        )
-        planner.list()
-        if with_units and worlds > 1:
-            planner.repeat_units()
-        if with_lists and any(self.subtrees):
-            planner.fill_batches()
-        if with_lists and self.flat:
-            planner.fill_flat()
-        return made
-
-    def _by_kind(self) -> list[int]:
-        members = self._arrays.plan.members
-        return [sum(self.subtrees[k : k + members]) for k in range(0, len(self.subtrees), members)]
+def _fill(made: PlanArrays, counts: Sequence[int], *, with_units: bool, with_lists: bool = True) -> None:
+    """Write subtrees and leaves outside them, units, or both, in all worlds."""
+    *subtrees, flat, units = counts
+    plan, worlds = made.plan, made.plan.worlds
+    plan.world_units = units
+    room = [worlds * n for n in subtrees], worlds * flat, worlds * units * with_units, worlds * plan.world_leaves
+    made.make(Room(*room))
+    made.list()
+    if with_units and worlds > 1:
+        made.repeat_units()
+    if with_lists and any(subtrees):
+        made.fill_batches()
+    if with_lists and flat:
+        made.fill_flat()

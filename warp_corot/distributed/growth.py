@@ -263,7 +263,7 @@ class GrowingTogether(Growing):
         known = np.zeros(growth.node_count, bool)
         known[: len(self._known)] = self._known
         # The corners of cubes are no midpoints.
-        fresh = np.flatnonzero((growth.active[: growth.node_count].numpy() != 0) & ~known & (ends[:, 0] >= 0))
+        fresh = np.flatnonzero((growth.forest.active[: growth.node_count].numpy() != 0) & ~known & (ends[:, 0] >= 0))
         known[fresh] = True
         given = []
         for places in partition.shared(lattice[fresh]):

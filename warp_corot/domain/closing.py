@@ -7,8 +7,6 @@ from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import breadth_first_order
 from scipy.spatial import cKDTree
 
 from warp_corot.errors import InputError
@@ -110,35 +108,12 @@ def wind_alike(triangles: np.ndarray, edges: Edges) -> tuple[np.ndarray, int]:
     a, b = one // 3, other // 3
     count = len(triangles)
     parts = linked(np.stack([a, b], axis=1), count)
-    # One node more, tied to one triangle of each part, makes a single search of all parts.
-    heads = np.unique(parts, return_index=True)[1]
-    rows, columns = np.append(a, np.full(len(heads), count)), np.append(b, heads)
-    links = coo_array((np.ones(len(rows)), (rows, columns)), shape=(count + 1, count + 1)).tocsr()
-    # In 64 bits, since keys are products.
-    order, parent = (each.astype(np.int64) for each in breadth_first_order(links, count, directed=False))
-    keys = np.minimum(a, b) * (count + 1) + np.maximum(a, b)
-    sort = np.argsort(keys)
-    here, above = order[1:], parent[order[1:]]
-    wanted = np.minimum(here, above) * (count + 1) + np.maximum(here, above)
-    found = sort[np.minimum(np.searchsorted(keys[sort], wanted), len(keys) - 1)]
-    differs = np.zeros(count + 1, bool)
-    differs[here] = against[found] & (above != count)
-    turned = _along(order, parent, differs)[:count]
-    majority = np.bincount(parts, weights=np.where(turned, 1, -1))[parts] > 0
-    turned ^= majority
-    triangles = np.where(turned[:, None], triangles[:, ::-1], triangles)
-    return triangles, int(turned.sum())
-
-
-def _along(order: np.ndarray, parent: np.ndarray, differs: np.ndarray) -> np.ndarray:
-    """Parity of the differences on the way from the root of a tree, by doubling the step up."""
-    up = np.where(np.arange(len(parent)) == order[0], order[0], parent)
-    parity = differs.copy()
-    while True:
-        further = parity ^ parity[up]
-        if (up == order[0]).all():
-            return parity
-        parity, up = further, up[up]
+    # Two of each triangle, one for each way to wind it: those that fit are linked.
+    fits = np.concatenate([np.stack([a, b + count * against]), np.stack([a + count, b + count * ~against])], axis=1)
+    side = linked(fits.T, 2 * count)
+    turned = side[:count] > side[count:]
+    turned ^= np.bincount(parts, weights=np.where(turned, 1, -1))[parts] > 0
+    return np.where(turned[:, None], triangles[:, ::-1], triangles), int(turned.sum())
 
 
 def wind_outwards(

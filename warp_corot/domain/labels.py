@@ -14,7 +14,7 @@ import numpy.typing as npt
 import scipy
 import warp as wp
 
-from warp_corot.domain.signed import SignedFunction
+from warp_corot.domain.domain import Domain
 from warp_corot.domain.units import length, metres_per_unit, unlikely_size, volume
 from warp_corot.errors import InputError
 from warp_corot.inputs.checks import checked_number, checked_numbers, shown
@@ -320,7 +320,7 @@ MARGIN = 2
 LARGEST_SMOOTHING = 0.1
 
 
-class LabelDomain(SignedFunction):
+class LabelDomain(Domain):
     """See `Domain.from_labels`.
 
     Args:
@@ -417,7 +417,7 @@ class LabelDomain(SignedFunction):
         counts = np.bincount(self.numbers.ravel(), minlength=len(self.label_names) + 1)[1:]
         return counts * abs(float(np.linalg.det(self.affine[:3, :3])))
 
-    def _part(self, name: str) -> SignedFunction:
+    def _part(self, name: str) -> Domain:
         chosen = (self.numbers == self.label_names.index(name) + 1).astype(np.int16)
         options = {"up_axis": self.up_axis, "device": self.device}
         return LabelDomain(chosen, self.affine, [name], self.smoothing, **options)
@@ -439,14 +439,14 @@ class LabelDomain(SignedFunction):
 Placing = tuple[Sequence[float] | None, Sequence[float] | None, npt.ArrayLike | None, str | float | None]
 
 
-def label_domain(given: Volume, labels: Any, placing: Placing, *options: Any) -> SignedFunction:
+def label_domain(given: Volume, labels: Any, placing: Placing, *options: Any) -> Domain:
     """See `Domain.from_labels`."""
     grid = placed_grid(given, *placing)
     numbers, names = numbered_labels(grid.values, labels)
     return _domain(grid, numbers, names, placing[-1], *options)
 
 
-def probability_domain(maps: Mapping[str, Volume], certain: float, placing: Placing, *options: Any) -> SignedFunction:
+def probability_domain(maps: Mapping[str, Volume], certain: float, placing: Placing, *options: Any) -> Domain:
     """See `Domain.from_probabilities`."""
     if not (isinstance(maps, Mapping) and maps):
         raise InputError("maps is empty; it must give at least one volume by label name")
@@ -463,7 +463,7 @@ def probability_domain(maps: Mapping[str, Volume], certain: float, placing: Plac
 
 def _domain(
     grid: Grid, numbers: np.ndarray, names: Sequence[str], unit: Any, smoothing: float, up_axis: str, device: Any
-) -> SignedFunction:
+) -> Domain:
     if not 0.0 <= checked_number(smoothing, "smoothing", "m") < np.inf:
         raise InputError(f"smoothing is {smoothing!r}; it must be a length [m], 0 for none")
     domain = LabelDomain(numbers, grid.affine, names, smoothing, grid.notes, up_axis=up_axis, device=device)

@@ -9,8 +9,8 @@ import numpy as np
 import scipy
 
 from .closing import areas
+from .domain import Domain
 from .labels import LabelDomain, piece_of_voxels
-from .signed import SignedFunction
 from .surface import SurfaceDomain
 
 #: Number of points along the longest side at which a function is first evaluated, and of halvings of cells at the
@@ -40,18 +40,17 @@ class Reference:
     pieces: int
 
 
-def reference_of(domain: SignedFunction, count: int) -> Reference:
+def reference_of(domain: Domain, count: int) -> Reference:
     """The measurements of a domain, without meshing it.
 
     Args:
         domain: Any domain. Results for surfaces and voxels are exact; for others volume and pieces come from samples.
         count: Approximate number of points.
     """
-    kind = domain.kind
-    if isinstance(kind, SurfaceDomain):
-        return _of_surface(kind, count)
-    if isinstance(kind, LabelDomain):
-        return _of_voxels(kind, count)
+    if isinstance(domain, SurfaceDomain):
+        return _of_surface(domain, count)
+    if isinstance(domain, LabelDomain):
+        return _of_voxels(domain, count)
     return _of_samples(domain, count)
 
 
@@ -122,7 +121,7 @@ def _of_voxels(domain: LabelDomain, count: int) -> Reference:
     return Reference(float(inside.sum()) * voxel, spread, owner[chosen].astype(np.int32), int(numbers.max()))
 
 
-def _of_samples(domain: SignedFunction, count: int) -> Reference:
+def _of_samples(domain: Domain, count: int) -> Reference:
     volume, points, pieces = _sampled(domain)
     points = _projected(domain, points)
     if len(points) > count:
@@ -130,7 +129,7 @@ def _of_samples(domain: SignedFunction, count: int) -> Reference:
     return Reference(volume, points, np.zeros(len(points), np.int32), pieces)
 
 
-def _sampled(domain: SignedFunction) -> tuple[float, np.ndarray, int]:
+def _sampled(domain: Domain) -> tuple[float, np.ndarray, int]:
     """Volume, points near the surface, and pieces, of cells that are halved where the surface may be."""
     low, size = domain.bounds[0], np.ptp(domain.bounds, axis=0)
     h = float(size.max()) / CELLS
@@ -158,7 +157,7 @@ def _sampled(domain: SignedFunction) -> tuple[float, np.ndarray, int]:
     raise AssertionError
 
 
-def _projected(domain: SignedFunction, points: np.ndarray) -> np.ndarray:
+def _projected(domain: Domain, points: np.ndarray) -> np.ndarray:
     """Points near the surface, moved onto it."""
     size = float(np.ptp(domain.bounds, axis=0).max())
     step = 1.0e-4 * size
@@ -170,18 +169,17 @@ def _projected(domain: SignedFunction, points: np.ndarray) -> np.ndarray:
     return points[np.abs(domain.phi(points)) < 1.0e-3 * size / CELLS]
 
 
-def extent_of(domain: SignedFunction) -> tuple[float, float]:
+def extent_of(domain: Domain) -> tuple[float, float]:
     """Approximate volume [m^3] and surface area [m^2] of a domain."""
-    kind = domain.kind
-    if isinstance(kind, SurfaceDomain):
-        return kind.closed.volume, float(areas(kind.closed.points, kind.closed.triangles).sum())
-    if isinstance(kind, LabelDomain):
-        inside = kind.numbers > 0
-        voxel = abs(float(np.linalg.det(kind.affine[:3, :3])))
+    if isinstance(domain, SurfaceDomain):
+        return domain.closed.volume, float(areas(domain.closed.points, domain.closed.triangles).sum())
+    if isinstance(domain, LabelDomain):
+        inside = domain.numbers > 0
+        voxel = abs(float(np.linalg.det(domain.affine[:3, :3])))
         area = 0.0
         for axis in range(3):
             faces = np.count_nonzero(np.diff(inside, axis=axis))
-            area += faces * voxel / float(np.linalg.norm(kind.affine[:3, axis]))
+            area += faces * voxel / float(np.linalg.norm(domain.affine[:3, axis]))
         # A staircase has about 1.5 times the area of the slope that it represents.
         return float(inside.sum()) * voxel, area / 1.5
     volume, points, _ = _sampled(domain)

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from warp_corot.domain.signed import SignedFunction
+from warp_corot.domain.domain import Domain, Function
 from warp_corot.domain.units import length
 from warp_corot.errors import InputError
 from warp_corot.inputs.checks import (
@@ -23,7 +23,7 @@ from warp_corot.inputs.checks import (
 from warp_corot.kernels.meshing import domain as kernels
 
 
-class ShapeDomain(SignedFunction):
+class ShapeDomain(Domain):
     """A shape whose distance is exact.
 
     Args:
@@ -80,16 +80,13 @@ def capsule(start: Sequence[float], end: Sequence[float], radius: float, **optio
     )
 
 
-#: A user's function or a Warp function; type checkers do not know the latter's type.
-Function = Callable[[np.ndarray], npt.ArrayLike]
-
 #: Pairs of points at which the slope is measured.
 PAIRS = 4096
 #: Rounding of float32 may add this to a slope.
 SLACK = 1.0e-2
 
 
-class FunctionDomain(SignedFunction):
+class FunctionDomain(Domain):
     """See `Domain.from_function`."""
 
     def __init__(self, function: Function, bounds: npt.ArrayLike, lipschitz: float, **options: Any):
@@ -162,16 +159,14 @@ class FunctionDomain(SignedFunction):
         return [f"a function, evaluated {how}", *(cut if self.reaches_bounds else [])]
 
 
-class DomainPair(SignedFunction):
+class DomainPair(Domain):
     """Two domains and the way they are combined."""
 
     outer: float
     inner: float
     word: str
 
-    def __init__(
-        self, first: SignedFunction, second: SignedFunction, bounds: np.ndarray, second_names: tuple[str, ...]
-    ):
+    def __init__(self, first: Domain, second: Domain, bounds: np.ndarray, second_names: tuple[str, ...]):
         names = first.label_names + tuple(name for name in second_names if name not in first.label_names)
         lipschitz = max(first.lipschitz, second.lipschitz)
         super().__init__(bounds, lipschitz, up_axis=first.up_axis, label_names=names, device=first.device)
@@ -193,7 +188,7 @@ class UnionDomain(DomainPair):
 
     outer, inner, word = -1.0, -1.0, "and also"
 
-    def __init__(self, first: SignedFunction, second: SignedFunction):
+    def __init__(self, first: Domain, second: Domain):
         lows, highs = np.stack([first.bounds, second.bounds], axis=1)
         super().__init__(first, second, np.stack([lows.min(axis=0), highs.max(axis=0)]), second.label_names)
 
@@ -206,7 +201,7 @@ class UnionDomain(DomainPair):
         wp.launch(kernels.choose_labels, points.size, [*phis, *labels, renumbered], [labels[0]], device=points.device)
         return labels[0]
 
-    def _part(self, name: str) -> SignedFunction:
+    def _part(self, name: str) -> Domain:
         first = self.first.part(name) if name in self.first.label_names else None
         if name not in self.second.label_names:
             return first or self
@@ -221,7 +216,7 @@ class IntersectionDomain(DomainPair):
 
     outer, inner, word = 1.0, 1.0, "cut to"
 
-    def __init__(self, first: SignedFunction, second: SignedFunction):
+    def __init__(self, first: Domain, second: Domain):
         lows, highs = np.stack([first.bounds, second.bounds], axis=1)
         bounds = np.stack([lows.max(axis=0), highs.min(axis=0)])
         if not (bounds[0] < bounds[1]).all():
@@ -234,7 +229,7 @@ class IntersectionDomain(DomainPair):
     def _labels(self, points: wp.array) -> wp.array:
         return (self.first if self.first.label_names else self.second)._labels(points)
 
-    def _part(self, name: str) -> SignedFunction:
+    def _part(self, name: str) -> Domain:
         one, other = (self.first, self.second) if self.first.label_names else (self.second, self.first)
         return IntersectionDomain(one.part(name), other)
 
@@ -244,20 +239,20 @@ class DifferenceDomain(DomainPair):
 
     outer, inner, word = 1.0, -1.0, "without"
 
-    def __init__(self, first: SignedFunction, second: SignedFunction):
+    def __init__(self, first: Domain, second: Domain):
         super().__init__(first, second, first.bounds, ())
 
     def _labels(self, points: wp.array) -> wp.array:
         return self.first._labels(points)
 
-    def _part(self, name: str) -> SignedFunction:
+    def _part(self, name: str) -> Domain:
         return DifferenceDomain(self.first.part(name), self.second)
 
 
-class NamedDomain(SignedFunction):
+class NamedDomain(Domain):
     """See `Domain.named`."""
 
-    def __init__(self, body: SignedFunction, name: str):
+    def __init__(self, body: Domain, name: str):
         if not (isinstance(name, str) and name):
             raise InputError(f"the label name is {shown(name)}; it must be a word")
         super().__init__(body.bounds, body.lipschitz, up_axis=body.up_axis, label_names=(name,), device=body.device)
@@ -269,13 +264,13 @@ class NamedDomain(SignedFunction):
     def _labels(self, points: wp.array) -> wp.array:
         return wp.full(points.size, 1, wp.int32, device=points.device)
 
-    def _part(self, name: str) -> SignedFunction:
+    def _part(self, name: str) -> Domain:
         return self
 
     def _details(self) -> list[str]:
         return self.body._details()
 
 
-def labels_or_none(domain: SignedFunction, points: wp.array) -> wp.array:
+def labels_or_none(domain: Domain, points: wp.array) -> wp.array:
     """A domain's labels, zeros if it has none."""
     return domain._labels(points) if domain.label_names else wp.zeros(points.size, wp.int32, device=points.device)

@@ -14,7 +14,7 @@ import numpy.typing as npt
 import warp as wp
 
 from warp_corot.domain.closing import SurfaceParts, part_volumes
-from warp_corot.domain.signed import SignedFunction
+from warp_corot.domain.domain import Domain
 from warp_corot.domain.units import length, metres_per_unit, unlikely_size, volume
 from warp_corot.errors import InputError
 from warp_corot.inputs.cpu_threads import launch_side_by_side
@@ -40,7 +40,7 @@ START = 0.01
 LARGE_HOLES = 0.01
 
 
-class SurfaceDomain(SignedFunction):
+class SurfaceDomain(Domain):
     """See `Domain.from_surface`.
 
     Args:
@@ -69,27 +69,14 @@ class SurfaceDomain(SignedFunction):
             )
 
     def _phi(self, points: wp.array) -> wp.array:
-        phi = wp.empty(points.size, wp.float32, device=points.device)
-        mesh = self._mesh(points.device)
-        inputs = [mesh.id, mesh.indices, self.lines]
-        launch_side_by_side(
-            kernels.evaluate_surface, points.size, lambda own: ([own(points), *inputs], [own(phi)]), points.device
-        )
-        return phi
+        return _found(kernels.evaluate_surface, [points], self._at_lines(points.device), wp.float32)[0]
 
     def holds(self, points: npt.ArrayLike) -> np.ndarray:
         return windings_of(self._mesh(self.device), self.lines, self._on_device(points)) > 0
 
     def exits(self, starts: np.ndarray, ends: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        given, along = self._on_device(starts), self._on_device(ends - starts)
-        shares, normals = (wp.empty(given.size, kind, device=self.device) for kind in (wp.float32, wp.vec3))
-        mesh = self._mesh(self.device)
-        launch_side_by_side(
-            kernels.find_exits,
-            given.size,
-            lambda own: ([own(given), own(along), mesh.id, mesh.indices, self.lines], [own(shares), own(normals)]),
-            self.device,
-        )
+        each, of_all = [self._on_device(starts), self._on_device(ends - starts)], self._at_lines(self.device)
+        shares, normals = _found(kernels.find_exits, each, of_all, wp.float32, wp.vec3)
         found = shares.numpy().astype(np.float64)
         return np.where(found < 0.0, np.nan, found), normals.numpy().astype(np.float64)
 
@@ -103,35 +90,27 @@ class SurfaceDomain(SignedFunction):
         return self.closed.pieces > 1
 
     def _thickness(self, points: wp.array, along: wp.array, reach: float, side: float) -> np.ndarray:
-        found = wp.empty(points.size, wp.float32, device=points.device)
         # A little inside, so that a ray does not hit the surface on which it starts.
         start = wp.array(points.numpy() + START * reach * along.numpy(), dtype=wp.vec3, device=points.device)
-        mesh = self._mesh(points.device)
-        launch_side_by_side(
-            kernels.evaluate_thickness,
-            points.size,
-            lambda own: ([own(start), own(along), reach, side, mesh.id], [own(found)]),
-            points.device,
-        )
+        of_all = [reach, side, self._mesh(points.device).id]
+        found = _found(kernels.evaluate_thickness, [start, along], of_all, wp.float32)[0]
         return np.minimum(found.numpy() + START * reach, reach)
 
     def lengths_inside(self, starts: np.ndarray) -> np.ndarray:
         """The length inside the body of the lines from points below it [m], float64 [n]; see `lines`."""
-        placed, mesh = self._on_device(starts), self._mesh(self.device)
-        lengths = wp.empty(placed.size, wp.float64, device=self.device)
-        launch_side_by_side(
-            windings.measure_lines,
-            placed.size,
-            lambda own: ([own(placed), mesh.id, mesh.indices, self.lines], [own(lengths)]),
-            self.device,
-        )
-        return lengths.numpy()
+        placed, of_all = self._on_device(starts), self._at_lines(self.device)
+        return _found(windings.measure_lines, [placed], of_all, wp.float64)[0].numpy()
 
     def _mesh(self, device: wp.Device) -> wp.Mesh:
         key = str(device)
         if key not in self._on:
             self._on[key] = surface_mesh(self.closed.points, self.closed.triangles, device)
         return self._on[key]
+
+    def _at_lines(self, device: wp.Device) -> list[Any]:
+        """What kernels take that follow the lines through the surface."""
+        mesh = self._mesh(device)
+        return [mesh.id, mesh.indices, self.lines]
 
     def _windings(self) -> tuple[float, float]:
         """Share of the enclosed space that is inside out, and that counts twice."""
@@ -165,7 +144,7 @@ class SurfaceDomain(SignedFunction):
         return [*lines, *(line for happened, line in said if happened)]
 
 
-def surface_domain(surface: Surface, unit: str | float | None, up_axis: str | None, device: Any) -> SignedFunction:
+def surface_domain(surface: Surface, unit: str | float | None, up_axis: str | None, device: Any) -> Domain:
     """See `Domain.from_surface`."""
     from .closing import close_surface
 
@@ -229,14 +208,15 @@ def lines_through(bounds: np.ndarray) -> windings.Lines:
 
 def windings_of(mesh: wp.Mesh, lines: windings.Lines, points: wp.array) -> np.ndarray:
     """Winding numbers of a closed surface around points, int32 [n]."""
-    found = wp.empty(points.size, wp.int32, device=points.device)
-    launch_side_by_side(
-        windings.find_windings,
-        points.size,
-        lambda own: ([own(points), mesh.id, mesh.indices, lines], [own(found)]),
-        points.device,
-    )
-    return found.numpy()
+    return _found(windings.find_windings, [points], [mesh.id, mesh.indices, lines], wp.int32)[0].numpy()
+
+
+def _found(kernel: wp.Kernel, each: list[wp.array], of_all: list[Any], *kinds: type) -> list[wp.array]:
+    """What a kernel finds, arrays of these types, by a thread for each entry of the first arrays."""
+    count, device = len(each[0]), each[0].device
+    found = [wp.empty(count, kind, device=device) for kind in kinds]
+    launch_side_by_side(kernel, count, lambda own: ([*map(own, each), *of_all], [*map(own, found)]), device)
+    return found
 
 
 def _given(
@@ -310,17 +290,10 @@ def _crossings(closed: ClosedSurface, device: wp.Device) -> np.ndarray:
     middle = closed.points.mean(axis=0)
     placed = wp.array(closed.points - middle, dtype=wp.vec3, device=device)
     mesh = wp.Mesh(placed, wp.array(closed.triangles.ravel(), dtype=wp.int32, device=device))
-    crossed = wp.empty(len(edges), dtype=wp.int32, device=device)
     of_edges = [wp.array(edges.astype(np.int32), dtype=wp.vec2i, device=device)]
     of_edges += [wp.array(own, dtype=wp.int32, device=device)]
-    of_triangles = [mesh.id, wp.array(closed.parts, dtype=wp.int32, device=device)]
-    launch_side_by_side(
-        windings.find_crossed_parts,
-        len(edges),
-        lambda own: ([placed, *map(own, of_edges), *of_triangles], [own(crossed)]),
-        device,
-    )
-    other = crossed.numpy()
+    of_all = [placed, mesh.id, wp.array(closed.parts, dtype=wp.int32, device=device)]
+    other = _found(windings.find_crossed_parts, of_edges, of_all, wp.int32)[0].numpy()
     return _different(own[other >= 0], other[other >= 0])
 
 

@@ -32,7 +32,7 @@ IMPLICIT = (
     *("implicit.conjugate_gradients", "implicit.increments", "elements.elements"),
 )
 IMPLICIT_ON_FORESTS = (
-    *("implicit.multigrid.values", "implicit.multigrid.pattern", "plan.levels"),
+    *("implicit.multigrid.values", "implicit.multigrid.pattern"),
     *("implicit.assembled", "implicit.multigrid.cycle", "implicit.lagged"),
 )
 #: Modules for explicit contact, besides its solver; and those for soft surfaces on the CPU.

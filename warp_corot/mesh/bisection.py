@@ -22,6 +22,10 @@ IntArray = npt.NDArray[np.int32]
 CHUNK = 4096
 
 
+#: Corners of the six path (Kuhn) tetrahedra of a cube [6, 4, 3], in cubes from its lowest corner.
+WALKS = np.array([np.tri(4, 3, -1, dtype=np.int64)[:, np.argsort(axes)] for axes in itertools.permutations(range(3))])
+
+
 def far_end(kind: int) -> int:
     """k of the refinement edge x0-xk of a type, which is also where the midpoint stands in both children."""
     return 3 - kind
@@ -114,12 +118,8 @@ def path_tetrahedra(cells: tuple[int, int, int], points: tuple[int, int, int]) -
         points: Number of grid points along x, y, z; a multiple of ``cells``, plus one. Nodes are numbered by grid
             points, z fastest.
     """
-    walks = np.zeros((6, 4, 3), np.int64)
-    for walk, order in zip(walks, itertools.permutations(range(3)), strict=True):
-        for step, axis in enumerate(order):
-            walk[step + 1 :, axis] = 1
     # The growth of a node's number from one cube to the next along each axis.
     strides = np.array([points[1] * points[2], points[2], 1])
     strides *= [(p - 1) // n for p, n in zip(points, cells, strict=True)]
     corners = np.indices(cells).reshape(3, -1).T @ strides
-    return (corners[:, None] + (walks @ strides).ravel()).reshape(-1, 4).astype(np.int32)
+    return (corners[:, None] + (WALKS @ strides).ravel()).reshape(-1, 4).astype(np.int32)

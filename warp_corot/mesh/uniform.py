@@ -23,8 +23,18 @@ import numpy as np
 import numpy.typing as npt
 
 from warp_corot.errors import InputError
-from warp_corot.mesh.bisection import CHUNK, IntArray, Patch, children, corner_leaves, far_end, patch, path_tetrahedra
-from warp_corot.mesh.tree import LIVE, VOID, Tree
+from warp_corot.mesh.bisection import (
+    CHUNK,
+    WALKS,
+    IntArray,
+    Patch,
+    children,
+    corner_leaves,
+    far_end,
+    patch,
+    path_tetrahedra,
+)
+from warp_corot.mesh.tree import LIVE, VOID, Tree, numbered
 
 #: Levels of a patch: 64 leaves on 35 or 37 nodes.
 PATCH_DEPTH = 6
@@ -64,25 +74,7 @@ def uniform_leaves(cells: tuple[int, int, int], level: int) -> tuple[IntArray, I
             nodes = number[points[start : start + CHUNK]]
             ends[nodes[:, table.middles[:, 0]]] = nodes[:, table.middles[:, 1:]]
     ends.sort(axis=1)
-    coordinates = np.empty((len(place_of), 3), np.int32)
-    for axis, along in enumerate(np.unravel_index(place_of, grid)):
-        coordinates[:, axis] = along
-    return coordinates, ends, last.leaves_of(number[places])
-
-
-def numbered(touched: IntArray, place_count: int) -> tuple[IntArray, IntArray]:
-    """Number places in the order in which they are first named.
-
-    Returns:
-        The number of each place, int32 [place_count] (undefined if nothing names it), and the place of each number.
-    """
-    number = np.empty(place_count, np.int32)
-    turn = np.arange(len(touched), dtype=np.int32)
-    # The last write to a place wins, so walk backwards to keep the first value.
-    number[touched[::-1]] = turn[::-1]
-    place_of = touched[number[touched] == turn]
-    number[place_of] = turn[: len(place_of)]
-    return number, place_of
+    return _coordinates(place_of, grid), ends, last.leaves_of(number[places])
 
 
 #: Levels of a subtree.
@@ -179,13 +171,9 @@ def _roots(
             f"the cubes of this part have {nx * ny * nz} grid places; there must be at most {MOST_PLACES}: take more "
             "ranks, or a lower level"
         )
-    walks = np.zeros((6, 4, 3), np.int64)
-    for walk, axes in zip(walks, itertools.permutations(range(3)), strict=True):
-        for step, axis in enumerate(axes):
-            walk[step + 1 :, axis] = 1
     strides = np.array([ny * nz, nz, 1], np.int64)
     tets = (intervals * (cubes - low)) @ strides
-    tets = tets[:, None] + intervals * (walks[roots % 6] @ strides)
+    tets = tets[:, None] + intervals * (WALKS[roots % 6] @ strides)
     return low.astype(np.int32), (nx, ny, nz), _Elements(roots, tets.astype(np.int32), np.ones(len(roots), bool))
 
 
@@ -236,7 +224,6 @@ def _tree(coarse: list[_Elements], number: IntArray, leaves: IntArray, level: in
     return Tree(tets, levels, parent, first_child)
 
 
-Ints = npt.NDArray[np.int32]
 Longs = npt.NDArray[np.int64]
 
 #: Number of points that descend at a time.
@@ -244,7 +231,7 @@ DESCENTS = 1 << 20
 
 
 def subtrees_around(
-    points: Ints, cells: tuple[int, int, int], intervals: int, depth: int, left_out: tuple[int, int]
+    points: IntArray, cells: tuple[int, int, int], intervals: int, depth: int, left_out: tuple[int, int]
 ) -> tuple[Longs, Longs]:
     """All pairs of a point and a subtree that holds it, except subtrees in one range.
 
@@ -267,7 +254,7 @@ def subtrees_around(
     return nodes, subtrees
 
 
-def _in_roots(points: Ints, cells: tuple[int, int, int], intervals: int) -> Iterator[tuple[Longs, Longs, Ints]]:
+def _in_roots(points: IntArray, cells: tuple[int, int, int], intervals: int) -> Iterator[tuple[Longs, Longs, IntArray]]:
     """Each point with each root that holds it: places of the points, the roots, and the weights there."""
     strides = np.array([cells[1] * cells[2], cells[2], 1], np.int64)
     for below in itertools.product((0, 1), repeat=3):
@@ -282,13 +269,13 @@ def _in_roots(points: Ints, cells: tuple[int, int, int], intervals: int) -> Iter
             yield node[held], first[held] + walk, weights[held]
 
 
-def _weights(inside: Ints, axes: tuple[int, ...], intervals: int) -> Ints:
+def _weights(inside: IntArray, axes: tuple[int, ...], intervals: int) -> IntArray:
     """Barycentric weights, times ``intervals``, in the path tetrahedron that goes along these axes; [n, 4]."""
     first, second, third = (inside[:, axis] for axis in axes)
     return np.stack([intervals - first, first - second, second - third, third], axis=1).astype(np.int32)
 
 
-def _below(given: tuple[Longs, Longs, Ints], depth: int, left_out: tuple[int, int]) -> tuple[Longs, Longs]:
+def _below(given: tuple[Longs, Longs, IntArray], depth: int, left_out: tuple[int, int]) -> tuple[Longs, Longs]:
     node, element, weights = given
     for level in range(depth + 1):
         above = depth - level
@@ -305,7 +292,7 @@ def _below(given: tuple[Longs, Longs, Ints], depth: int, left_out: tuple[int, in
     return node, element
 
 
-def _first(weights: Ints, k: int) -> Ints:
+def _first(weights: IntArray, k: int) -> IntArray:
     """The weights in the first child, which keeps the corner before the edge's midpoint."""
     made = weights.copy()
     made[:, 0] -= weights[:, k]
@@ -313,7 +300,7 @@ def _first(weights: Ints, k: int) -> Ints:
     return made
 
 
-def _second(weights: Ints, k: int) -> Ints:
+def _second(weights: IntArray, k: int) -> IntArray:
     made = weights.copy()
     made[:, : k - 1] = weights[:, 1:k]
     made[:, k - 1] = weights[:, k] - weights[:, 0]

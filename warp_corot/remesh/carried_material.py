@@ -15,7 +15,6 @@ from warp_corot.discretization.changing.pools import DeviceForest
 from warp_corot.discretization.changing.transfer import Column, Numbers
 from warp_corot.discretization.discretization import Discretization
 from warp_corot.discretization.elements import copied
-from warp_corot.discretization.levels import TreeNodes
 from warp_corot.inputs.cpu_threads import team_of
 from warp_corot.kernels.corotated.anisotropic import OrthotropicMaterial, vec9
 from warp_corot.kernels.remesh.derived import assemble_materials
@@ -254,9 +253,9 @@ class ChangingMesh(Discretization):
             self._carried.serve(plan, self.lame)
         return plan
 
-    def _tree_nodes(self) -> TreeNodes:
-        pools, others = self._forest.pools, self._forest.virtual_count
-        return TreeNodes(pools.lattice, pools.ends, self.sizes.world_nodes, pools.node_limit, others)
+    def _tree_nodes(self) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.int32], int]:
+        pools, used = self._forest.pools, self._forest.nodes_in_use
+        return pools.lattice.numpy()[used], pools.ends.numpy()[used], pools.node_limit
 
     def anisotropic_material(self) -> OrthotropicMaterial:
         return self._carried.anisotropic

@@ -215,23 +215,17 @@ class CarriedActivation:
                 self._body.conditions.set_activations(made)
 
     def _write(self, name: str, given: wp.array) -> None:
-        columns, number = self._columns(name)
-        inputs = [self._forest.pools.leaves, given, number]
-        wp.launch(kernels.WRITE_LEAVES[given.dtype], len(given), inputs, [columns], device=self._body.device)
+        wp.copy(self._of_leaves(name, len(given)), given)
 
     def _read(self, name: str) -> wp.array:
-        columns, number = self._columns(name)
-        count = self._body.element_count
-        found = wp.empty(count, dtype=columns.dtype, device=self._body.device)
-        inputs = [self._forest.pools.leaves, columns, number]
-        wp.launch(kernels.READ_LEAVES[found.dtype], count, inputs, [found], device=self._body.device)
-        return found
+        return self._of_leaves(name, self._body.element_count).contiguous()
 
-    def _columns(self, name: str) -> tuple[wp.array, int]:
-        carriage = self._forest.carriage
+    def _of_leaves(self, name: str, count: int) -> Any:
+        """What the first leaves carry by a name, in place."""
+        carriage, leaves = self._forest.carriage, self._forest.pools.leaves[:count]
         if name in carriage.names:
-            return carriage.arrays.values, carriage.names.index(name)
-        return carriage.arrays.numbers, carriage.number_names.index(name)
+            return wp.indexedarray(carriage.arrays.values[:, carriage.names.index(name)], [leaves])
+        return wp.indexedarray(carriage.arrays.numbers[:, carriage.number_names.index(name)], [leaves])
 
 
 #: The arrays that ``put_back`` restores.

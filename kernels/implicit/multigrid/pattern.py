@@ -64,6 +64,34 @@ def parents(i: int, coarse: int, ends: wp.array[wp.vec2i]):
 
 
 @wp.kernel(enable_backward=False)
+def flag_first(
+    # In
+    keys: wp.array[wp.int64],
+    # Out
+    flags: wp.array[wp.int32],
+):
+    """Flag the first of equal keys."""
+    i = wp.tid()
+    flags[i] = 1
+    if i > 0 and keys[i - 1] == keys[i]:
+        flags[i] = 0
+
+
+@wp.kernel(enable_backward=False)
+def gather_flagged(
+    # In
+    flags: wp.array[wp.int32],
+    places: wp.array[wp.int32],
+    # Out
+    chosen: wp.array[wp.int32],
+):
+    """Indices of flagged entries, in order; ``places`` is the inclusive sum of the flags."""
+    i = wp.tid()
+    if flags[i] != 0:
+        chosen[places[i] - 1] = i
+
+
+@wp.kernel(enable_backward=False)
 def find_ranks(
     # In
     nodes: wp.array[wp.int32],

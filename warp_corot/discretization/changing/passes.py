@@ -162,19 +162,15 @@ class RemeshPass(_Launches):
         self._origin = wp.vec3d(*forest.source.origin)
         self._spacing = lattice_spacing(forest.source.cell_size)
         self.contents = self._make_contents(lame)
-        nodes, threads, device = forest.node_capacity, forest.threads, self.device
-        size = 1 << (2 * (nodes + threads)).bit_length()
+        nodes, device = forest.node_capacity, self.device
+        size = 1 << (2 * (nodes + forest.threads)).bit_length()
         of_edges = [(size, "keys born ring agreed pairs head node wanted")]
         begin = {"keys": -1, "born": int(refine.NEVER), "head": -1, "node": -1}
         self._edges = allocated(refine.WantedEdges, device, of_edges, **begin)
         # Threads that add an edge at the same time may exceed the limit, but never fill the table.
         self._edges.most = size // 2
-        none, blocks = int(refine.NONE), forest.capacity // int(refine.BLOCK) + 1
-        of_blocks = [((nodes, refine.KEPT), "of_node"), (nodes, "latest"), (blocks, "hot"), (1, "all_hot")]
-        self._blocks = allocated(refine.Blocks, device, of_blocks, of_node=none, latest=none)
         self._removal = allocated(simplify.Removal, device, [(nodes, "willing head candidates")], head=-1)
-        of_moves = [(nodes, "holes movers forward"), (2 * threads, "sums ends")]
-        self._moves = allocated(order.Moves, device, of_moves)
+        self._moves = allocated(order.Moves, device, [(nodes, "holes movers forward"), (2, "counts")])
         self._demand = wp.zeros(1, dtype=wp.int64, device=self.device)
         self._goes_on = wp.zeros(1, dtype=wp.int32, device=self.device)
         self._sums, self._ends = (wp.zeros(forest.threads, dtype=wp.int32, device=self.device) for _ in range(2))
@@ -187,51 +183,38 @@ class RemeshPass(_Launches):
             goes_on: Whether this pass and the last one count as one; neither may remove nodes.
         """
         forest = self.forest
-        pools, carried, edges, removal = forest.pools, forest.carriage.arrays, self._edges, self._removal
+        pools, carried, edges = forest.pools, forest.carriage.arrays, self._edges
+        removal, moves = self._removal, self._moves
         self._once(pool_kernels.begin_pass, int(goes_on), pools)
         if not marked:
             refine_above, simplify_below = self.thresholds
             inputs = [refine_above, simplify_below, self._origin, self._spacing, carried.u, self.parameters]
             self._many(self._mark, *inputs, self.contents, pools)
         self._many(refine.want_marked, self.levels[1], pools, edges)
-        self._many(refine.clear_blocks, pools, self._blocks)
-        self._many(refine.list_blocks, pools, self._blocks)
-        self._many(refine.heat_wanted, pools, edges, self._blocks)
-        self._once(refine.begin_rounds, pools, self._goes_on)
+        self._once(refine.next_round, pools, self._demand, self._goes_on)
         wp.capture_while(self._goes_on, self._launch_round)
         self._many(simplify.offer_nodes, self.levels[0], self._kept, carried, pools, removal)
         self._many(simplify.remove_nodes, pools, carried, removal)
-        self._once(pool_kernels.give_back, pools)
         self._many(pool_kernels.settle_ends, pools, carried)
-        self._launch_moves()
+        self._many(order.list_moves, pools, moves)
+        self._many(order.move_nodes, pools, carried, moves)
+        self._many(order.rename_nodes, moves, pools)
         self._many(pool_kernels.refresh_masses, pools, carried)
         self._many(order.count_leaves, pools, self._sums)
         wp.utils.array_scan(self._sums, self._ends, inclusive=True)
         self._many(order.list_leaves, self._sums, self._ends, pools)
-        self._many(order.adopt_list, self._moves, pools)
-        self._many(order.rename_void, self._moves, pools)
-        self._once(order.adopt_count, pools)
-        self._many(refine.clear_edges, pools, edges)
+        self._many(order.adopt_list, pools)
+        self._many(refine.end_pass, pools, edges, moves.counts)
 
     # --- pieces ----------------------------------------------------------------------------------------------------
 
     def _launch_round(self) -> None:
         pools, edges, carried = self.forest.pools, self._edges, self.forest.carriage.arrays
-        self._once(refine.begin_round, pools, self._demand)
-        self._many(refine.visit_leaves, pools, edges, self._blocks)
-        self._many(refine.visit_fresh, pools, edges, self._blocks)
+        self._many(refine.visit_leaves, pools, edges)
+        self._many(refine.visit_fresh, pools, edges)
         self._many(refine.admit_edges, pools, edges, self._demand)
         self._many(refine.bisect_edges, pools, edges, carried)
-        self._once(refine.end_round, pools, self._goes_on)
-
-    def _launch_moves(self) -> None:
-        pools, moves = self.forest.pools, self._moves
-        self._many(order.count_moves, pools, moves)
-        wp.utils.array_scan(moves.sums, moves.ends, inclusive=True)
-        self._many(order.list_moves, pools, moves)
-        self._once(order.lower_top, pools)
-        self._many(order.move_nodes, pools, self.forest.carriage.arrays, moves)
-        self._many(order.rename_ends, moves, pools)
+        self._once(refine.next_round, pools, self._demand, self._goes_on)
 
     def _make_contents(self, lame: tuple[float, float] | tuple[str, str]) -> Contents:
         names = self.forest.carriage.names
@@ -331,7 +314,7 @@ class CutPass(_Launches):
 
     def _launch_split(self) -> None:
         pools, carried, cuts = self.forest.pools, self.forest.carriage.arrays, self._cuts
-        self._once(split_kernels.begin_stars, cuts)
+        cuts.counts[: int(cut_kernels.STARS) + 1].zero_()
         self._many(split_kernels.list_stars, pools, cuts)
         self._many(split_kernels.unite_corners, pools, cuts)
         self._many(split_kernels.choose_keepers, pools, cuts)
@@ -359,6 +342,8 @@ GROWTH = 1.5
 MOST_CHANGES = 50
 #: Stiffnesses with a smaller relative difference count as equal.
 ALIKE = 1e-3
+#: What a survey of the leaves finds.
+SURVEY_PLACES = 1 + (MAX_LEVEL + 1) * int(kernels.PARTIAL_SUMS)
 
 
 @dataclass
@@ -395,7 +380,7 @@ class Survey:
     def __init__(self, forest: DeviceForest, modulus: float):
         self._forest = forest
         self._modulus = modulus
-        self.found = wp.zeros(kernels.SURVEY_PLACES, dtype=wp.int32, device=forest.device)
+        self.found = wp.zeros(SURVEY_PLACES, dtype=wp.int32, device=forest.device)
         self.last = Findings()
         self.finest_level = 0
         self.stiffness, self._finest = 0.0, 0
@@ -404,17 +389,16 @@ class Survey:
         """Launch the measurement of the elements if ``goes`` [1] is not zero; may be recorded."""
         forest = self._forest
         device, threads = forest.device, forest.threads
-        wp.launch(begin_counts, dim=kernels.SURVEY_PLACES, inputs=[goes], outputs=[self.found], device=device)
+        wp.launch(begin_counts, dim=SURVEY_PLACES, inputs=[goes], outputs=[self.found], device=device)
         inputs = [threads, goes, self._modulus, forest.pools, forest.carriage.arrays]
-        wp.launch(kernels.find_stiffest, dim=threads, inputs=inputs, outputs=[self.found], device=device)
-        inputs = [threads, goes, forest.pools]
-        wp.launch(kernels.count_finest, dim=threads, inputs=inputs, outputs=[self.found], device=device)
+        wp.launch(kernels.survey_leaves, dim=threads, inputs=inputs, outputs=[self.found], device=device)
 
     def read(self, found: npt.NDArray[np.int32]) -> None:
         """Take a copy of ``found`` of a mesh that has changed."""
         self.stiffness = float(found[: int(kernels.STIFFEST) + 1].view(np.float32)[-1])
-        self.finest_level = int(found[kernels.FINEST_LEVEL])
-        self._finest = int(found[kernels.FINEST_COUNTS :].sum())
+        of_levels = found[1:].reshape(-1, int(kernels.PARTIAL_SUMS)).sum(axis=1)
+        self.finest_level = int(np.flatnonzero(of_levels).max(initial=0))
+        self._finest = int(of_levels[self.finest_level])
         self.last.changes += 1
 
     def step_may_change(self) -> bool:

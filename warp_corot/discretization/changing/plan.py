@@ -13,7 +13,7 @@ from warp_corot.discretization.changing.pools import DeviceForest
 from warp_corot.discretization.elements import device_frames, edge_lengths
 from warp_corot.discretization.groups import cubes_of
 from warp_corot.discretization.plan import LeafCounts, Sharing, Units
-from warp_corot.discretization.planner import GRANULE, PlanArrays, Planner, Room
+from warp_corot.discretization.planner import GRANULE, PlanArrays, Room
 from warp_corot.discretization.sizes import allocated
 from warp_corot.kernels.elements.elements import ForestElements
 from warp_corot.kernels.plan import changing as kernels
@@ -91,12 +91,12 @@ class DevicePlan:
         most_leaves = forest.capacity + LEAF_PADDING
         self._most_subtrees = max(-(-forest.capacity // (8 * GRANULE)) if subtrees else 0, 1) * GRANULE
         self.elements = self._leaves(most_leaves)
-        made = PlanArrays(tree_of(forest), self.elements, rotation_level, subtrees=subtrees, grouped=grouped)
+        options = {"subtrees": subtrees, "grouped": grouped}
+        made = PlanArrays(tree_of(forest), self.elements, rotation_level, forest.threads, **options)
         self._made, self._plan = made, made.plan
         classes, shared = made.plan.classes, made.rotation_shared
         made.make(Room([self._most_subtrees] * classes, most_leaves, most_leaves * shared, most_leaves))
         self._fill_in(most_leaves)
-        self._planner = Planner(made, forest.threads)
         self._rows = classes + 2
         all_leaves = slice(self._rows, self._rows + 1)
         self.counts = LeafCounts(
@@ -114,19 +114,19 @@ class DevicePlan:
 
     def launch(self) -> None:
         """Launch the derivation of the plan if the last pass has changed the mesh; may be recorded."""
-        forest, plan, planner = self.forest, self._plan, self._planner
+        forest, plan, made = self.forest, self._plan, self._made
         wp.launch(kernels.begin_plan, 1, [forest.pools, plan], device=self.device)
-        inputs = [forest.threads, forest.pools, self._made.tree, forest.carriage.arrays.values, plan]
+        inputs = [forest.threads, forest.pools, made.tree, forest.carriage.arrays.values, plan]
         wp.launch(kernels.gather_leaves, forest.threads, inputs, device=self.device)
         if not (self._with_subtrees or self.rotation_shared):
             return
-        planner.find()
-        planner.list()
+        made.find()
+        made.list()
         if self._with_subtrees:
-            planner.fill_batches()
-            planner.fill_flat()
+            made.fill_batches()
+            made.fill_flat()
         if self.rotation_shared:
-            planner.pad_units()
+            made.pad_units()
 
     def outdate(self) -> None:
         """Make the next launches derive the plan even if the last pass changed nothing, as after ``restart``."""

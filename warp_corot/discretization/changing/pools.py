@@ -104,7 +104,7 @@ class Snapshot:
             array_of(pools, carried, name).fill_(_UNUSED.get(name, 0))
         for name, start, values in self.pieces:
             array_of(pools, carried, name)[start : start + len(values)].assign(values)
-        counts = self.counts.copy()
+        counts = self.counts[: kernels.COUNTS].copy()
         # The count of rounds continues, so that nodes touched in later rounds do not look newly touched.
         counts[kernels.STAMP] = present[kernels.STAMP]
         pools.counts.assign(counts)
@@ -126,7 +126,7 @@ def check_places(
     levels = len(carried.volume)
     places, nodes, named = len(pools.level), len(pools.lattice), len(carried.rest)
     bounds = {"tets": (-1, nodes), "ends": (-1, nodes), "leaf_tets": (0, named), "level": (-1, levels)}
-    bounds |= {name: (0, places) for name in ("leaves", "free_pairs", "void_leaves")}
+    bounds |= {name: (0, places) for name in ("leaves", "free_pairs")}
     bounds |= {"parent": (-1, places), "first_child": (min(int(LIVE), int(VOID)), places)}
     for key, values in pieces.items():
         name, _, _ = key.partition(".")
@@ -159,7 +159,6 @@ def _in_use(pools: kernels.Pools, carried: Carried, counts: npt.NDArray[np.int32
     yield "free_pairs", 0, int(counts[kernels.FREE_PAIRS])
     for name in ("leaves", "leaf_tets"):
         yield name, 0, int(counts[kernels.LEAVES])
-    yield "void_leaves", 0, pools.void_count
     yield "impulse", 0, 1
     yield "cut_area", 0, 1
 
@@ -396,9 +395,6 @@ class DeviceForest:
         most_pairs = (self.tree_capacity - pools.roots) // 2
         pools.free_pairs = self._filled(free_pairs, most_pairs, wp.int32)
         pools.fresh = wp.empty(max(most_pairs, 1), dtype=wp.int32, device=device)
-        void = np.flatnonzero((tree.first_child == VOID) & (tree.tets.min(axis=1) < forest.node_count))
-        pools.void_leaves = self._filled(void, len(void), wp.int32)
-        pools.void_count = len(void)
         pools.lattice = self._filled(forest.lattice, self.node_capacity, wp.vec3i, places=number)
         ends = np.where(forest.node_ends < 0, np.int32(-1), number[forest.node_ends])
         pools.ends = self._filled(ends, self.node_capacity, wp.vec2i, -1, places=number)

@@ -23,7 +23,7 @@ from warp_corot.kernels.elements.dilatation import VOLUME
 from warp_corot.kernels.math.rotation import byers_xu, quick_rotation
 from warp_corot.materials.anisotropic import Anisotropic
 from warp_corot.mesh import TetForest
-from warp_corot.mesh.forest import MAX_LEVEL
+from warp_corot.mesh.lattice import MAX_LEVEL
 
 if TYPE_CHECKING:
     from warp_corot.discretization.discretization import Discretization, Discretized

@@ -337,6 +337,8 @@ def _unpacked_snapshot(kept_in: tuple[Any, Any], packed: dict[str, Any]) -> Snap
     pieces = []
     for key, values in packed["pieces"].items():
         name, _, start = key.rpartition(".")
+        if name == "void_leaves":  # of earlier versions
+            continue
         like = array_of(*kept_in, name)
         on_device = wp.array(values, dtype=like.dtype, ndim=like.ndim, device=like.device)
         pieces.append(Piece(name, int(start), on_device))

@@ -319,7 +319,7 @@ def mesh_domain(
         raise InputError("cell_size is None; it must be a length in metres where target_elements is not given")
     growing = Growing(domain, cell_size, wishes, where)
     growing.run()
-    wished = growing.growth.first_child[: growing.growth.element_count].numpy().copy()
+    wished = growing.growth.forest.first_child[: growing.growth.element_count].numpy().copy()
     if detail:
         growing.look_closer(detail, CLOSER_ERROR, CLOSER_ELEMENTS)
     grown = growing.grown(wished)

@@ -12,7 +12,6 @@ import numpy as np
 import warp as wp
 
 from warp_corot.errors import InputError
-from warp_corot.inputs.arguments import forwards
 from warp_corot.inputs.cpu_threads import launch_side_by_side
 from warp_corot.kernels.meshing import growth as kernels
 from warp_corot.mesh.bisection import path_tetrahedra
@@ -28,7 +27,6 @@ if TYPE_CHECKING:
 ROOM = 2
 
 
-@forwards("forest", "tets", "level", "parent", "first_child", "wished", "bound", "lattice", "ends", "active")
 class Growth:
     """Tetrahedra, nodes and the edges whose midpoints the nodes are, bisected in rounds.
 
@@ -42,18 +40,8 @@ class Growth:
         device: The device of the computation.
 
     Attributes:
-        forest: ``kernels.meshing.growth.Forest``, whose arrays of elements and nodes are attributes, too.
+        forest: ``kernels.meshing.growth.Forest``.
     """
-
-    tets: wp.array
-    level: wp.array
-    parent: wp.array
-    first_child: wp.array
-    wished: wp.array
-    bound: wp.array
-    lattice: wp.array
-    ends: wp.array
-    active: wp.array
 
     def __init__(self, lattice: np.ndarray, ends: np.ndarray, tree: Tree, device: wp.Device):
         self.device = device
@@ -163,11 +151,11 @@ class Growth:
 
     def nodes(self) -> tuple[np.ndarray, np.ndarray]:
         """Lattice points int32 [n, 3] and ends int32 [n, 2]."""
-        return self.lattice[: self.node_count].numpy(), self.ends[: self.node_count].numpy()
+        return self.forest.lattice[: self.node_count].numpy(), self.forest.ends[: self.node_count].numpy()
 
     def tree(self) -> Tree:
-        count = self.element_count
-        return Tree(*(a[:count].numpy() for a in (self.tets, self.level, self.parent, self.first_child)))
+        forest, count = self.forest, self.element_count
+        return Tree(*(a[:count].numpy() for a in (forest.tets, forest.level, forest.parent, forest.first_child)))
 
     def launch(self, kernel: wp.Kernel, count: int, *arguments: Any) -> None:
         wp.launch(kernel, count, list(arguments), device=self.device)
@@ -400,6 +388,6 @@ class Growing:
         need = judge.needs()[wished.numpy()]
         least = np.partition(need, len(need) - room - 1)[len(need) - room - 1]
         judge.tolerances = np.maximum(judge.tolerances, least)
-        growth.wished.zero_()
+        growth.forest.wished.zero_()
         kept = wished.numpy()[need > least]
         return wp.array(kept, dtype=wp.int32, device=growth.device)

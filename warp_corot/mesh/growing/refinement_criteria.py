@@ -117,7 +117,7 @@ class Judge:
         growth.launch(kernels.judge_by_corners, count, first, *levels, self._forest, states)
         self._judge_all(first, states)
         if not self.limited:
-            growth.wished[first : growth.element_count].assign(states.numpy() == int(kernels.SPLIT))
+            self._forest.wished[first : growth.element_count].assign(states.numpy() == int(kernels.SPLIT))
         return self.of_state(states, kernels.SPLIT, first)
 
     def off(self) -> wp.array:
@@ -284,7 +284,7 @@ class Judge:
 
     def _places(self, nodes: np.ndarray) -> np.ndarray:
         """The places of lattice points [m], float64 [..., 3]."""
-        return np.asarray(self._forest.origin) + self.growth.lattice.numpy()[nodes] * self._forest.spacing
+        return np.asarray(self._forest.origin) + self._forest.lattice.numpy()[nodes] * self._forest.spacing
 
     def _on_device(self, numbers: np.ndarray) -> wp.array:
         return wp.array(numbers, dtype=wp.float32, device=self.device)

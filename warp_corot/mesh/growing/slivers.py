@@ -4,7 +4,7 @@ body."""
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
@@ -229,15 +229,14 @@ def strays(tets: np.ndarray, held: np.ndarray, given_up: np.ndarray, domain: Dom
         given_up: Which are not part of the mesh, bool [n].
         domain: The body.
     """
-    found = np.zeros(len(held), bool)
-    if getattr(domain.kind, "closed", None) is None or len(tets) > MOST_ELEMENTS:
+    found, body = np.zeros(len(held), bool), cast("Any", domain)
+    if not hasattr(body, "closed") or len(tets) > MOST_ELEMENTS:
         return found, ""
     pairs = face_pairs(tets)
     kept = np.flatnonzero(~given_up)
     _, piece = np.unique(linked(pairs[~given_up[pairs].any(axis=1)], len(held))[kept], return_inverse=True)
     # Parts of a surface that touch or cross are one piece of the body.
-    kind: Any = domain.kind
-    if not piece.any() or kind.joined[0] > 1:
+    if not piece.any() or body.joined[0] > 1:
         return found, ""
     volumes = np.bincount(piece, held[kept])
     stray = volumes < STRAY * volumes.sum()

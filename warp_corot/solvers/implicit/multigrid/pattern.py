@@ -12,8 +12,6 @@ from warp_corot.discretization.groups import Members
 from warp_corot.discretization.plan import Batch
 from warp_corot.kernels.implicit.multigrid import pattern as kernels
 from warp_corot.kernels.implicit.multigrid import subtrees as roots_kernels
-from warp_corot.kernels.meshing.growth import gather_flagged
-from warp_corot.kernels.plan.levels import flag_first
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,12 +148,12 @@ class PatternFinder:
     def _pattern(self, nodes: int, contributions: int, keys: wp.array, codes: wp.array) -> Pattern:
         self._sort(keys, codes, contributions)
         flags, numbers = self._ints(contributions), self._ints(contributions)
-        self._launch(flag_first, contributions, [keys], [flags])
+        self._launch(kernels.flag_first, contributions, [keys], [flags])
         wp.utils.array_scan(flags, numbers, inclusive=True)
         count = int(numbers[-1:].numpy()[0])
         starts = self._ints(count + 1)
         starts.fill_(contributions)
-        self._launch(gather_flagged, contributions, [flags, numbers, 0], [starts])
+        self._launch(kernels.gather_flagged, contributions, [flags, numbers], [starts])
         upper = wp.empty(count, dtype=wp.vec2i, device=self.device)
         full, sources = self._keys(2 * count)
         self._launch(kernels.name_upper, count, [nodes, self.bits, keys, starts], [upper, full, sources])
