@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from warp_corot.contact.options import Contact, checked_friction
+from warp_corot.contact.options import Contact, checked_friction, may_meet
 from warp_corot.contact.shapes import Box, Capsule, Cylinder, Ground, Shape, Sphere, axis_of
 from warp_corot.contact.skin import own_surface
 from warp_corot.contact.tool import Obstacle, Tool
@@ -250,7 +250,8 @@ def place_ground(touched: RunContact, args: argparse.Namespace, bodies: Sequence
     if height in (None, AUTO):
         # The lowest point on which contact will act.
         whole = are_several() and INTEGRATORS[integrator_name(args)].is_implicit
-        owns = [None if whole else own_surface(body.subject.mesh) for body in bodies]
+        is_close = not may_meet(len(bodies), touched.contact)
+        owns = [None if whole else own_surface(body.subject.mesh, is_close=is_close) for body in bodies]
         points = [
             body.subject.mesh.points[body.subject.used] if own is None else own.points
             for body, own in zip(bodies, owns, strict=True)

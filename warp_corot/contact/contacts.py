@@ -87,7 +87,8 @@ class Contacts:
         are_own = on_surfaces and options.on == SURFACE
         have_own = are_own and any(has_own_surface(system.ranks.owned(body).whole.mesh) for body in system.bodies)
         is_whole = (meets or have_own) and not system.ranks.is_alone
-        made = WholeSurface(system, are_own=are_own) if is_whole else ContactSurface(system.bodies, are_own=are_own)
+        kind = {"are_own": are_own, "are_close": not meets}
+        made = WholeSurface(system, **kind) if is_whole else ContactSurface(system.bodies, **kind)
         self.surface: ContactSurface = made
         #: The exchange with ranks that have other places of the surface.
         self._shared = SurfaceHalo(ALONE if is_whole else system.ranks, self.surface)

@@ -13,7 +13,7 @@ from warp_corot.discretization.changing.transfer import FollowingBinding
 from warp_corot.kernels.remesh import derived as kernels
 from warp_corot.mesh.forest import TetForest
 from warp_corot.mesh.surfaces.bound import BoundPoints, SurfaceMesh
-from warp_corot.mesh.surfaces.clustering import Clusters, clustered, departures, longest_edge, resolved, split
+from warp_corot.mesh.surfaces.clustering import Clusters, closer, clustered, departures, longest_edge, resolved, split
 
 if TYPE_CHECKING:
     from warp_corot.body.soft_body import SoftBody
@@ -49,10 +49,10 @@ class Skin:
     opposite: Ints
 
     @classmethod
-    def of(cls, body: SoftBody, *, is_own: bool) -> Skin:
+    def of(cls, body: SoftBody, *, is_own: bool, is_close: bool) -> Skin:
         """The surface of a body's present mesh: the body's own if there is one and ``is_own``, or the boundary of the
         tetrahedra."""
-        own = own_surface(body.mesh) if is_own else None
+        own = own_surface(body.mesh, is_close=is_close) if is_own else None
         if own is not None:
             return cls.of_surface(own)
         tets = body.mesh.tets
@@ -100,12 +100,14 @@ def has_own_surface(mesh: TetForest | TetMesh) -> bool:
     return isinstance(mesh, TetForest) and mesh.phi is not None
 
 
-def own_surface(mesh: TetForest | TetMesh) -> SurfaceMesh | None:
-    """The marched surface of a mesh, with points about as far apart as its nodes; None without such a surface."""
+def own_surface(mesh: TetForest | TetMesh, *, is_close: bool) -> SurfaceMesh | None:
+    """The marched surface of a mesh, with points about as far apart as its nodes, or closer on coarse meshes; None
+    without such a surface."""
     if not isinstance(mesh, TetForest) or mesh.phi is None:
         return None
     whole = mesh.surface()
-    return clustered(whole, resolved(whole, apart(mesh, levels_at(mesh, whole))))
+    sizes = apart(mesh, levels_at(mesh, whole))
+    return clustered(whole, resolved(whole, closer(whole, sizes) if is_close else sizes))
 
 
 def levels_at(mesh: TetForest, points: BoundPoints) -> Ints:
@@ -150,11 +152,12 @@ class FollowedSurface:
 
     Args:
         body: A body that is remeshed and has its own surface.
+        is_close: Whether points are closer on coarse meshes.
     """
 
-    def __init__(self, body: SoftBody):
+    def __init__(self, body: SoftBody, *, is_close: bool):
         assert body.changing is not None
-        self._body = body
+        self._body, self._is_close = body, is_close
         self._known: Skin | None = None
         self._known_levels: Numbers = np.zeros(0, np.int32)
         self._kept: Numbers = np.zeros(0, np.int64)
@@ -201,7 +204,7 @@ class FollowedSurface:
         levels = levels_at(source, bound)
         sizes = apart(source, levels)
         surface = SurfaceMesh(points, bound.nodes, weights, triangles)
-        resolved_sizes = resolved(surface, sizes)
+        resolved_sizes = resolved(surface, closer(surface, sizes) if self._is_close else sizes)
         fewer = np.rint(3.0 * np.log2(sizes / resolved_sizes))
         self._far = departures(surface, resolved_sizes)
         #: The lowest level at each point with which the surface keeps its shape, of those down to ``_tried``.

@@ -66,6 +66,7 @@ class ContactSurface:
         bodies: All bodies, with the same number of worlds.
         are_own: Whether contact acts on bodies' own surfaces, where they have one; otherwise on the boundary of their
             tetrahedra.
+        are_close: Whether these have more points on coarse meshes, which pays against obstacles alone.
         device: The device of the surfaces; None: that of the bodies.
 
     Attributes:
@@ -86,9 +87,16 @@ class ContactSurface:
     #: Whether places of nodes that other ranks move are among them, with all values.
     is_whole = False
 
-    def __init__(self, bodies: Sequence[SoftBody], *, are_own: bool = False, device: wp.Device | None = None):
+    def __init__(
+        self,
+        bodies: Sequence[SoftBody],
+        *,
+        are_own: bool = False,
+        are_close: bool = False,
+        device: wp.Device | None = None,
+    ):
         self.bodies, self.worlds, self.device = tuple(bodies), bodies[0].worlds, device or bodies[0].device
-        self.are_own = are_own
+        self.are_own, self.are_close = are_own, are_close
         self.revision = 0
         self.parts: list[Part] = []
         self._followed: dict[int, FollowedSurface] = {}
@@ -255,13 +263,13 @@ class ContactSurface:
     def _skin(self, k: int) -> Skin:
         body = self.bodies[k]
         if body.changing is None or not self.are_own or not has_own_surface(body.changing.forest.source):
-            return Skin.of(body, is_own=self.are_own)
+            return Skin.of(body, is_own=self.are_own, is_close=self.are_close)
         if body.cut_area > 0.0:
             # Points of both lips must not be made one.
             self._followed.pop(k, None)
             return Skin.of_surface(cast("TetForest", body.mesh).surface())
         if k not in self._followed:
-            self._followed[k] = FollowedSurface(body)
+            self._followed[k] = FollowedSurface(body, is_close=self.are_close)
         return self._followed[k].skin()
 
     def _room_for_bearing(self, count: int) -> Bearing:

@@ -29,15 +29,15 @@ class WholeSurface(ContactSurface):
 
     Args:
         system: The parts of the bodies that this rank computes.
-        are_own: As for ``ContactSurface``.
+        are_own, are_close: As for ``ContactSurface``.
     """
 
     is_whole = True
 
-    def __init__(self, system: System, *, are_own: bool = False):
+    def __init__(self, system: System, *, are_own: bool = False, are_close: bool = False):
         self._system = system
         wholes = [system.ranks.owned(body).whole for body in system.bodies]
-        super().__init__(wholes, are_own=are_own, device=system.device)
+        super().__init__(wholes, are_own=are_own, are_close=are_close, device=system.device)
 
     @property
     def own(self) -> Surface:

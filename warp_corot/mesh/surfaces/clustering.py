@@ -49,6 +49,9 @@ def longest_edge(points: Floats, triangles: Ints, sizes: Floats) -> float:
 #: Where vertices would be farther from the coarser surface than this many sizes, or, where the body is not thin, than
 #: this fraction of the largest extent of the surface, sizes are halved, this many times.
 LOST, HANGING, HALVED = 0.15, 0.005, 2
+#: ``closer`` puts vertices no farther apart than this fraction of the largest extent of the surface, and no closer than
+#: this fraction of the given sizes.
+CLOSE, CLOSEST = 0.02, 0.4
 #: The weight of the distance from the middle of a cluster, among squares of distances from planes.
 FLAT = 0.1
 
@@ -139,6 +142,18 @@ def _errors(points: Floats, cluster: Ints, sums: Floats) -> Floats:
             number += 1
     areas = own[:, [0, 4, 7]].sum(axis=1)
     return error + FLAT * areas * ((points - middles[cluster]) ** 2).sum(axis=1)
+
+
+def closer(surface: SurfaceMesh, sizes: Floats) -> Floats:
+    """Smaller sizes where they are large for the body: elements that are pressed flat carry what is drawn between the
+    points that touch into an obstacle. They are smaller by whole levels, so that remeshed bodies have the same.
+
+    Args:
+        surface: The surface.
+        sizes: The size at each of its vertices [m], [V].
+    """
+    extent = max(float(np.ptp(surface.points, axis=0).max(initial=0.0)), 1e-30)
+    return sizes * 2.0 ** (np.rint(3.0 * np.log2(np.clip(CLOSE * extent / sizes, CLOSEST, 1.0))) / 3.0)
 
 
 def resolved(surface: SurfaceMesh, sizes: Floats) -> Floats:
