@@ -371,7 +371,7 @@ class ForceField(ABC):
         """
         return None
 
-    def launch(self, kernel: wp.Kernel, dim: int, inputs: list, outputs: list) -> None:
+    def launch(self, kernel: wp.Kernel, dim: int | tuple[int, int], inputs: list, outputs: list) -> None:
         launch(kernel, dim, inputs, outputs, device=self.device)
 
     def _launch_over_elements(
