@@ -42,6 +42,9 @@ MEETING = 1.5
 #: The largest square of a hat function's gradient, times the square of the edge length.
 STEEPEST = max(sum(columns[c][n] ** 2 for c in range(3)) for columns in GRADIENT for n in range(4))
 
+#: What eight elements are in C++.
+EIGHT = {ForestElements: "ForestEight", GeneralElements: "GeneralEight"}
+
 mat43 = wp.types.matrix(shape=(4, 3), dtype=wp.float32)
 
 
@@ -119,9 +122,8 @@ def find_taut(Elements: type) -> wp.Kernel:
 @functools.cache
 def find_taut8(Elements: type) -> wp.Kernel:
     """The same on the CPU, from the ``begin``-th eight elements on; a thread is eight elements."""
-    kind = "GeneralEight" if Elements is GeneralElements else "ForestEight"
     given = "isotropic, dilating, shared, mass, scales, u, taut, turns, twists, swells"
-    call = f"corot::find_taut<corot::{kind}>(elements, block, count, {MEETING}f, {STEEPEST!r}f, {given});"
+    call = f"corot::find_taut<corot::{EIGHT[Elements]}>(elements, block, count, {MEETING}f, {STEEPEST!r}f, {given});"
 
     @wp.func_native(on_cpu(call))
     def eight_elements(
@@ -166,20 +168,6 @@ def find_taut8(Elements: type) -> wp.Kernel:
     return find_taut8
 
 
-@unique_kernel()
-def list_taut(
-    # In
-    taut: wp.array[wp.uint8],
-    threads: int,
-    # Out
-    listed: wp.array[wp.int32],
-):
-    """List the elements whose tension counts behind their number, which is zero before, by so many ``threads``."""
-    for t in range(wp.tid(), taut.shape[0], threads):
-        if taut[t] != wp.uint8(0):
-            listed[wp.atomic_add(listed, 0, 1) + 1] = t
-
-
 @wp.func
 def cofactor_change(a: wp.mat33, b: wp.mat33):
     """The derivative of the cofactor of a in the direction b."""
@@ -191,59 +179,96 @@ def cofactor_change(a: wp.mat33, b: wp.mat33):
 
 @functools.cache
 def add_taut_product(Elements: type) -> wp.Kernel:
-    """y += K p of tension; so many ``threads`` take the listed elements in turn."""
+    """y += K p of tension; a thread an element (CUDA)."""
 
     @unique_kernel()
     def add_taut_product(
         # In
         elements: Elements,
+        taut: wp.array[wp.uint8],
         turns: wp.array[wp.mat33],
         twists: wp.array[wp.mat33],
         swells: wp.array[wp.mat33],
-        listed: wp.array[wp.int32],
-        threads: int,
         p: wp.array[wp.vec4],
         # In and out
         y: wp.array[wp.vec4],
     ):
-        for i in range(wp.tid(), listed[0], threads):
-            t = listed[i + 1]
-            turn = turns[t]
-            b = local_gradient(elements, t, p) * wp.transpose(turn)
-            stress = wp.skew(0.5 * (twists[t] * axial(b)))
-            if swells.shape[0] > 0:
-                stress += cofactor_change(swells[t], b)
-            add_nodal_forces(elements, t, -stress * turn, elements.nodes[t], y)
+        t = wp.tid()
+        if taut[t] == wp.uint8(0):
+            return
+        turn = turns[t]
+        b = local_gradient(elements, t, p) * wp.transpose(turn)
+        stress = wp.skew(0.5 * (twists[t] * axial(b)))
+        if swells.shape[0] > 0:
+            stress += cofactor_change(swells[t], b)
+        add_nodal_forces(elements, t, -stress * turn, elements.nodes[t], y)
 
     return add_taut_product
 
 
 @functools.cache
+def add_taut_product8(Elements: type) -> wp.Kernel:
+    """The same on the CPU; a thread is eight of ``count`` elements."""
+
+    @wp.func_native(
+        on_cpu(
+            f"corot::add_taut_product<corot::{EIGHT[Elements]}>(elements, block, count, taut, turns, twists, swells, p, y);"
+        )
+    )
+    def eight_elements(
+        elements: Elements,
+        block: int,
+        count: int,
+        taut: wp.array[wp.uint8],
+        turns: wp.array[wp.mat33],
+        twists: wp.array[wp.mat33],
+        swells: wp.array[wp.mat33],
+        p: wp.array[wp.vec4],
+        y: wp.array[wp.vec4],
+    ): ...
+
+    @unique_kernel(native=headers("tension"))
+    def add_taut_product8(
+        # In
+        elements: Elements,
+        count: int,
+        taut: wp.array[wp.uint8],
+        turns: wp.array[wp.mat33],
+        twists: wp.array[wp.mat33],
+        swells: wp.array[wp.mat33],
+        p: wp.array[wp.vec4],
+        # In and out
+        y: wp.array[wp.vec4],
+    ):
+        eight_elements(elements, wp.tid(), count, taut, turns, twists, swells, p, y)
+
+    return add_taut_product8
+
+
+@functools.cache
 def add_taut_diagonal(Elements: type) -> wp.Kernel:
-    """Add the 3x3 blocks of tension on K's diagonal to those of the nodes; threads as above."""
+    """Add the 3x3 blocks of tension on K's diagonal to those of the nodes; a thread a node of an element."""
 
     @unique_kernel()
     def add_taut_diagonal(
         # In
         elements: Elements,
+        taut: wp.array[wp.uint8],
         turns: wp.array[wp.mat33],
         twists: wp.array[wp.mat33],
-        listed: wp.array[wp.int32],
-        threads: int,
         # In and out
         blocks: wp.array[wp.mat33],
     ):
+        t = wp.tid() // 4
+        n = wp.tid() % 4
+        if taut[t] == wp.uint8(0):
+            return
         x = wp.vec3(1.0, 0.0, 0.0)
-        for i in range(wp.tid(), listed[0], threads):
-            t = listed[i + 1]
-            half = 0.5 * rest_volume(elements, t)
-            n = int(0)
-            while n < 4:
-                unit = gradient_of(
-                    elements, t, where_is(n == 0, x), where_is(n == 1, x), where_is(n == 2, x), where_is(n == 3, x)
-                )
-                along = wp.skew(turns[t] * unit[0])
-                wp.atomic_add(blocks, elements.nodes[t][n], half * (wp.transpose(along) * twists[t] * along))
-                n += 1
+        unit = gradient_of(
+            elements, t, where_is(n == 0, x), where_is(n == 1, x), where_is(n == 2, x), where_is(n == 3, x)
+        )
+        along = wp.skew(turns[t] * unit[0])
+        block = (0.5 * rest_volume(elements, t)) * (wp.transpose(along) * twists[t] * along)
+        wp.atomic_add(blocks, elements.nodes[t][n], block)
 
     return add_taut_diagonal

@@ -142,6 +142,14 @@ template <class Units> struct ForestEight : Eight<Units> {
         const lanes8 inverse = 1.0f / h;
         for (int j = 0; j < 3; ++j) a[j] = chosen(is_2, a2[j], chosen(is_1, a1[j], a[j])) * inverse;
     }
+    COROT_INLINE void forces_of(const triple<lanes8>* p, triple<lanes8>* force) const {
+        triple<lanes8> scaled[3], f1[4], f2[4];
+        for (int j = 0; j < 3; ++j) scaled[j] = p[j] * (-1.0f / h);
+        shape_forces<0>(scaled, force);
+        shape_forces<1>(scaled, f1);
+        shape_forces<2>(scaled, f2);
+        for (int n = 0; n < 4; ++n) force[n] = chosen(is_2, f2[n], chosen(is_1, f1[n], force[n]));
+    }
 };
 
 // The columns of the gradient of nodal vectors, times the frame.

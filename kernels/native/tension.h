@@ -164,6 +164,47 @@ COROT_INLINE void find_taut(const At& at, float meeting, float of_shapes, const 
     for (int lane = 0; lane < at.end; ++lane) taut.data[at.place(lane)] = counts[lane] != 0;
 }
 
+// y += K p of tension, of eight elements.
+template <class At, class Vectors, class Flags, class Matrices>
+COROT_INLINE void add_taut_product(const At& at, const Flags& taut, const Matrices& turns, const Matrices& twists,
+        const Matrices& swells, const Vectors& p, const Vectors& y) {
+    const lanes8 zero = spread<lanes8>(0.0f);
+    masks8 counts;
+    for (int lane = 0; lane < 8; ++lane) counts[lane] = taut.data[at.place(lane)] ? -1 : 0;
+    triple<lanes8> a[3], r[3], stress[3], force[4];
+    lanes8 m[9];
+    gradient_of(at, p, a);
+    gather_matrix([&](int lane) { return turns.data[at.place(lane)].data[0]; }, m);
+    for (int j = 0; j < 3; ++j) r[j] = {m[j], m[3 + j], m[6 + j]};
+    r[2] = r[2] * handedness_of(at.frame);
+    const lanes8 weight = counts ? volume_of(at) : zero;
+    gather_matrix([&](int lane) { return twists.data[at.place(lane)].data[0]; }, m);
+    const triple<lanes8> axial = cross(r[0], a[0]) + cross(r[1], a[1]) + cross(r[2], a[2]);
+    const triple<lanes8> rows[3] = {{m[0], m[1], m[2]}, {m[3], m[4], m[5]}, {m[6], m[7], m[8]}};
+    const triple<lanes8> moment = triple<lanes8>{dot(rows[0], axial), dot(rows[1], axial), dot(rows[2], axial)} * 0.5f;
+    for (int j = 0; j < 3; ++j) stress[j] = cross(moment, r[j]);
+    if (swells.shape[0]) {
+        // The change of the cofactor of p S in the direction B = dF R^T, times R.
+        gather_matrix([&](int lane) { return swells.data[at.place(lane)].data[0]; }, m);
+        const triple<lanes8> s[3] = {{m[0], m[3], m[6]}, {m[1], m[4], m[7]}, {m[2], m[5], m[8]}};
+        const triple<lanes8> b[3] = {combined(r[0].x, a[0], r[1].x, a[1], r[2].x, a[2]),
+            combined(r[0].y, a[0], r[1].y, a[1], r[2].y, a[2]), combined(r[0].z, a[0], r[1].z, a[1], r[2].z, a[2])};
+        const triple<lanes8> c[3] = {cross(b[1], s[2]) + cross(s[1], b[2]), cross(b[2], s[0]) + cross(s[2], b[0]),
+            cross(b[0], s[1]) + cross(s[0], b[1])};
+        for (int j = 0; j < 3; ++j) stress[j] = stress[j] + combined(r[j].x, c[0], r[j].y, c[1], r[j].z, c[2]);
+    }
+    for (int j = 0; j < 3; ++j) stress[j] = chosen(counts, stress[j] * weight, nothing<lanes8>());
+    at.forces_of(stress, force);
+    at.add_forces(force, y);
+}
+
+template <template <class> class At, class Units, class Flags, class... Rest>
+COROT_INLINE void add_taut_product(const Units& units, int block, int count, const Flags& taut, const Rest&... rest) {
+    const int first = 8 * block, end = least_of(first + 8, count);
+    for (int t = first; t < end; ++t)
+        if (taut.data[t]) return add_taut_product(At<Units>(units, first, count), taut, rest...);
+}
+
 template <template <class> class At, class Units, class... Rest>
 COROT_INLINE void find_taut(const Units& units, int block, int count, const Rest&... rest) {
     find_taut(At<Units>(units, 8 * block, count), rest...);

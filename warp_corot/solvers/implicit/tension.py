@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import warp as wp
@@ -18,9 +17,6 @@ from warp_corot.kernels.elements.simd8 import LANES
 if TYPE_CHECKING:
     from warp_corot.elasticity import ForceField
     from warp_corot.elasticity.tangents import Tangent
-
-#: Threads that share the list of taut elements on CUDA.
-THREADS = 1 << 14
 
 
 class Tension:
@@ -42,7 +38,6 @@ class Tension:
         self._law, _ = law_of(field)
         self._device, self._kind = field.device, field.discretization.element_kind
         self._regions = Regions(field.discretization.team, field.device)
-        self._threads = THREADS if field.device.is_cuda else 1
         self._none = wp.zeros(0, dtype=wp.vec4, device=field.device)
         self.taut = wp.zeros(0, dtype=wp.uint8, device=field.device)
         self.prepare()
@@ -59,9 +54,9 @@ class Tension:
     @property
     def kernels(self) -> list[wp.Kernel]:
         """Kernels of factories that it launches."""
-        find = kernels.find_taut8 if self._device.is_cpu else kernels.find_taut
-        factories = find, kernels.add_taut_product, kernels.add_taut_diagonal
-        return [kernels.list_taut, *(make(self._kind) for make in factories)]
+        on_cpu, on_cuda = (kernels.find_taut8, kernels.add_taut_product8), (kernels.find_taut, kernels.add_taut_product)
+        factories = on_cpu if self._device.is_cpu else on_cuda
+        return [make(self._kind) for make in (*factories, kernels.add_taut_diagonal)]
 
     def prepare(self) -> None:
         """Make room for the present elements; not while launches are recorded."""
@@ -71,7 +66,6 @@ class Tension:
             self.taut = wp.zeros(count, dtype=wp.uint8, device=device)
             counts = count, count, count * self._field.shares_dilatation
             self._turns, self.twists, self.swells = (wp.zeros(n, dtype=wp.mat33, device=device) for n in counts)
-            self._listed = wp.zeros(count + 1, dtype=wp.int32, device=device)
 
     def take(self, u: wp.array) -> None:
         """Launch the update to displacements u [m], vec4, for which the tangent has been taken."""
@@ -86,19 +80,19 @@ class Tension:
             self._regions.launch_from(kernel, -(-count // LANES), [0, count, *inputs], outputs, *key)
         else:
             field.launch(kernels.find_taut(self._kind), count, inputs, outputs)
-        self._listed.zero_()
-        threads = count if self._device.is_cuda else 1
-        wp.launch(kernels.list_taut, threads, [self.taut, threads], [self._listed], device=self._device)
 
     def add_product(self, p: wp.array, y: wp.array) -> None:
         """Launch y += K p [N]; both vec4 [worlds * N]."""
-        self._launch(kernels.add_taut_product, [self.twists, self.swells], [p], [y])
+        count, elements = self._field.element_count, self._field.discretization.elements
+        inputs = [self.taut, self._turns, self.twists, self.swells, p]
+        if self._device.is_cpu:
+            kernel = kernels.add_taut_product8(self._kind)
+            self._field.launch(kernel, -(-count // LANES), [elements, count, *inputs], [y])
+        else:
+            self._field.launch(kernels.add_taut_product(self._kind), count, [elements, *inputs], [y])
 
     def add_diagonal(self, blocks: wp.array) -> None:
         """Launch the addition of the 3x3 blocks on K's diagonal to those of the nodes [N/m], mat33 [worlds * N]."""
-        self._launch(kernels.add_taut_diagonal, [self.twists], [], [blocks])
-
-    def _launch(self, make: Callable[[type], wp.Kernel], of_elements: list, inputs: list, outputs: list) -> None:
-        field = self._field
-        inputs = [field.discretization.elements, self._turns, *of_elements, self._listed, self._threads, *inputs]
-        field.launch(make(self._kind), self._threads, inputs, outputs)
+        count, inputs = self._field.element_count, [self.taut, self._turns, self.twists]
+        kernel = kernels.add_taut_diagonal(self._kind)
+        self._field.launch(kernel, 4 * count, [self._field.discretization.elements, *inputs], [blocks])
