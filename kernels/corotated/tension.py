@@ -210,11 +210,9 @@ def add_taut_product(Elements: type) -> wp.Kernel:
 def add_taut_product8(Elements: type) -> wp.Kernel:
     """The same on the CPU; a thread is eight of ``count`` elements."""
 
-    @wp.func_native(
-        on_cpu(
-            f"corot::add_taut_product<corot::{EIGHT[Elements]}>(elements, block, count, taut, turns, twists, swells, p, y);"
-        )
-    )
+    given = "taut, turns, twists, swells, p, y"
+
+    @wp.func_native(on_cpu(f"corot::add_taut_product<corot::{EIGHT[Elements]}>(elements, block, count, {given});"))
     def eight_elements(
         elements: Elements,
         block: int,

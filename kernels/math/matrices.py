@@ -96,3 +96,11 @@ def all_finite(a: wp.mat33):
             # A comparison with NaN is false, and so is one with an infinity beyond the largest float.
             ok = ok and (wp.abs(a[i, j]) <= MAX_FLOAT)
     return ok
+
+
+@wp.func
+def semidefinite(a: wp.mat33):
+    """A symmetric block without its negative eigenvalues."""
+    q, values = wp.eig3(0.5 * (a + wp.transpose(a)))
+    kept = wp.vec3(wp.max(values[0], 0.0), wp.max(values[1], 0.0), wp.max(values[2], 0.0))
+    return q * wp.diag(kept) * wp.transpose(q)

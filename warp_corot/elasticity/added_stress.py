@@ -129,6 +129,9 @@ class AddedStressField(ForceField):
     def tangent(self, *, exact: bool = False) -> Tangent:
         return SumTangent(self.law.tangent(exact=exact), ElementTangent(self, *self._own_law))
 
+    def definite_tangent(self) -> Tangent:
+        return SumTangent(self.law.definite_tangent(), ElementTangent(self, *self._own_law))
+
     @property
     def stiffest(self) -> SmallForces:
         return Stiffest(self)

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -15,8 +15,8 @@ from warp_corot.discretization.groups import Members
 from warp_corot.discretization.plan import Batch, Plan
 from warp_corot.elasticity.cpu import Dilating
 from warp_corot.elasticity.groups import ClusteredGroups, ElementGroups, elements_of, group_numbers
-from warp_corot.elasticity.model import ForceField, SmallForces
-from warp_corot.elasticity.tangents import ElementTangent, Tangent
+from warp_corot.elasticity.model import ForceField, Kept, SmallForces
+from warp_corot.elasticity.tangents import DefiniteTangent, ElementTangent, Tangent
 from warp_corot.errors import InputError
 from warp_corot.inputs.arguments import forwards
 from warp_corot.inputs.checks import checked_choice, shown
@@ -24,6 +24,7 @@ from warp_corot.inputs.choices import AUTO, ELEMENT, SHARED
 from warp_corot.inputs.loading import LoadedKernel, load
 from warp_corot.kernels.elements import dilatation as kernels
 from warp_corot.kernels.elements import mean_dilatation_rows as rows
+from warp_corot.kernels.elements.definite import with_dilatation
 from warp_corot.kernels.elements.dilatation import SMALL, VOLUME, Dilatation, DilatedMaterial
 from warp_corot.kernels.elements.mean_dilatation_rows import NO_LIMIT
 from warp_corot.kernels.elements.simd8 import LANES, STRESSLESS
@@ -44,21 +45,28 @@ class SharedTangent(Tangent):
     Args:
         field: The field.
         exact: As for ``ForceField.tangent``.
+        definite: Whether what elements have by themselves is without negative parts, if the law has principal axes.
 
     Attributes:
-        shear: The tangent of the law's field.
+        shear: The tangent of the law's field, or of all that elements have by themselves.
         shared: The change of h' and w' of the elements, see ``kernels.elements.dilatation``, vec4 [T].
     """
 
     field: DilatationField
 
-    def __init__(self, field: DilatationField, exact: bool):
+    def __init__(self, field: DilatationField, exact: bool, definite: bool = False):
         super().__init__(field)
-        self.shear = field.shear.tangent(exact=exact)
+        own, law = kernels.own_differential(field.of), field.shear.stress_law
         # The differential of the gradient of a dilatation acts in each element separately.
         self._turns = (exact or field.of is not VOLUME) and field.of is not SMALL
-        own = kernels.own_differential(field.of), self._material, DilatedMaterial
-        self._of_elements = ElementTangent(field, *own)
+        self._of_elements: ElementTangent | None = None
+        if definite and law is not None and getattr(field.shear, "has_principal_axes", False):
+            Both, differential = with_dilatation(law.Material, law.differential, own)
+            self._both = Kept(Both, "law", "dilated")
+            self.shear: Tangent = DefiniteTangent(field, differential, self._both_materials, Both)
+        else:
+            self.shear = field.shear.tangent(exact=exact)
+            self._of_elements = ElementTangent(field, own, self._material, DilatedMaterial)
         self._holds = field.of.is_held
         self._version = -1
         self.shared = wp.zeros(0, dtype=wp.vec4, device=field.device)
@@ -70,7 +78,8 @@ class SharedTangent(Tangent):
     def prepare(self, u: wp.array) -> None:
         super().prepare(u)
         self.shear.prepare(u)
-        self._of_elements.displacements = self.displacements
+        if self._of_elements is not None:
+            self._of_elements.displacements = self.displacements
         field, version = self.field, self.field.discretization.sizes.version
         if self._version != version:
             self._version = version
@@ -82,11 +91,11 @@ class SharedTangent(Tangent):
 
     def take(self, u: wp.array) -> None:
         super().take(u)
-        self.shear.take(u)
         field = self.field
         inputs = [0, 0, 0, self._members.arrays, field.elements, self.displacements, field.isotropic, NO_LIMIT]
         outputs = [self._rows, self.shared]
         field.launch(rows.write_rows(field.kind, field.of), (1, self._members.count), inputs, outputs)
+        self.shear.take(u)
 
     def add_product(self, p: wp.array, y: wp.array) -> None:
         self.shear.add_product(p, y)
@@ -94,6 +103,8 @@ class SharedTangent(Tangent):
         lanes = rows.THREADS if field.device.is_cuda else 1
         groups, count = [self._members.arrays, self._rows], self._members.count
         field.launch(rows.add_row_products, lanes * count, [lanes, *groups, p], [y])
+        if self._of_elements is None:
+            return
         if self._turns:
             self._of_elements.add_product(p, y)
         elif self._holds:
@@ -104,7 +115,7 @@ class SharedTangent(Tangent):
         self.shear.add_diagonal(blocks)
         field = self.field
         field.launch(rows.add_row_blocks, self._members.count, [self._members.arrays, self._rows], [blocks])
-        if self._turns or self._holds:
+        if self._of_elements is not None and (self._turns or self._holds):
             self._of_elements.add_diagonal(blocks)
 
     def _material(self) -> DilatedMaterial:
@@ -112,6 +123,11 @@ class SharedTangent(Tangent):
         material.isotropic, material.shared = self.field.isotropic, self.shared
         material.turning = float(self._turns)
         return material
+
+    def _both_materials(self) -> Any:
+        law = self.field.shear.stress_law
+        assert law is not None
+        return self._both.made(law.material, self._material())
 
 
 # --- the force field -------------------------------------------------------------------------------------------------
@@ -295,6 +311,9 @@ class DilatationField(ForceField):
         derivatives of the rotations and of the gradient of J, too, and may be indefinite.
         """
         return SharedTangent(self, exact)
+
+    def definite_tangent(self) -> Tangent:
+        return SharedTangent(self, exact=False, definite=True)
 
     @property
     def stiffest(self) -> SmallForces:

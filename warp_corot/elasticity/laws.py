@@ -16,6 +16,7 @@ from warp_corot.elasticity.clusters import divided
 from warp_corot.elasticity.cpu import SimdForces
 from warp_corot.elasticity.dilatation import AUTO, bind_law, check_dilatation
 from warp_corot.elasticity.model import ElementField, ForceField, Model
+from warp_corot.elasticity.tangents import DefiniteTangent, Tangent
 from warp_corot.errors import InputError
 from warp_corot.inputs.checks import checked_number, shown
 from warp_corot.inputs.loading import LoadedKernel, load
@@ -54,6 +55,8 @@ class LawField(ElementField):
             deterministic=deterministic,
         )
         self._uniform = discretization.material_stride == 0
+        #: Linear elasticity has no principal axes of its own, and is semidefinite.
+        self.has_principal_axes = law != "linear"
         if self.device.is_cpu:
             self._simd = SimdForces(discretization, self.plan, law, lambda: self.isotropic)
         self.follow()
@@ -61,6 +64,11 @@ class LawField(ElementField):
     def plan_of(self, discretization: Discretization) -> Plan:
         subtrees = self.device.is_cpu or self.deterministic or discretization.prefers_subtrees
         return discretization.plan(subtrees=subtrees, deterministic=self.deterministic)
+
+    def definite_tangent(self) -> Tangent:
+        if not self.has_principal_axes:
+            return self.tangent()
+        return DefiniteTangent(self, self.stress_law.differential, lambda: self.material, self._Material)
 
     @property
     def _force_kernels(self) -> list[LoadedKernel]:

@@ -209,6 +209,10 @@ class ForceField(ABC):
         assert law is not None
         return ElementTangent(self, law.differential, lambda: cast("StressLaw", self.stress_law).material, law.Material)
 
+    def definite_tangent(self) -> Tangent:
+        """A positive semidefinite K(u) where the field has one, otherwise ``tangent``."""
+        return self.tangent()
+
     def add_stiffness(self, u: wp.array, p: wp.array, y: wp.array, *, exact: bool = False) -> None:
         """Add K(u) p to y [N], of displacements u and p [m]; all vec4 [worlds * N].
 

@@ -9,6 +9,7 @@ from typing import Any
 import warp as wp
 
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial
+from warp_corot.kernels.elements.definite import DefiniteMaterial, definite_differential, keep_definite
 from warp_corot.kernels.elements.forces import add_stiffness_diagonal, add_stiffness_product
 
 
@@ -77,6 +78,38 @@ class ElementTangent(Tangent):
     def add_diagonal(self, blocks: wp.array) -> None:
         inputs = [self.field.elements, self._material(), self.displacements]
         self.field.launch(add_stiffness_diagonal(*self._generated_from), 4 * self.field.element_count, inputs, [blocks])
+
+
+class DefiniteTangent(ElementTangent):
+    """K of an isotropic law without the negative parts of each element's; see ``kernels.elements.definite``.
+
+    Args:
+        field, differential, material, Material: As for ``ElementTangent``, of the exact differential.
+    """
+
+    def __init__(self, field: Any, differential: wp.Function, material: Callable[[], Any], Material: type):
+        self._blocks = DefiniteMaterial()
+        super().__init__(field, definite_differential, lambda: self._blocks, DefiniteMaterial)
+        self._exact = material
+        self._keep = keep_definite(field.discretization.element_kind, Material, differential)
+        self._count = 0
+
+    def prepare(self, u: wp.array) -> None:
+        super().prepare(u)
+        count = self.field.element_count
+        if self._count != count:
+            self._count = count
+            self._kept = [
+                wp.zeros(count, dtype=dtype, device=self.field.device)
+                for dtype in (wp.mat33, wp.mat33, wp.mat33, wp.vec3, wp.vec3)
+            ]
+            for name, array in zip(("left", "right", "stretches", "shears", "turns"), self._kept, strict=True):
+                setattr(self._blocks, name, array)
+
+    def take(self, u: wp.array) -> None:
+        super().take(u)
+        inputs = [self.field.elements, self._exact(), self.displacements]
+        self.field.launch(self._keep, self._count, inputs, self._kept)
 
 
 class SumTangent(Tangent):

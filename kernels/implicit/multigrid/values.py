@@ -23,6 +23,7 @@ from warp_corot.kernels.elements.elements import (
     rest_volume,
 )
 from warp_corot.kernels.elements.simd8 import constants
+from warp_corot.kernels.math.matrices import semidefinite
 from warp_corot.kernels.math.rotation import quick_rotation
 from warp_corot.kernels.modules import unique_kernel
 
@@ -233,14 +234,6 @@ def inverse_block(a: wp.mat33):
             unit += 0.05 * wp.identity(n=3, dtype=float)
         result = wp.inverse(unit) / third
     return result
-
-
-@wp.func
-def semidefinite(a: wp.mat33):
-    """A symmetric block without its negative eigenvalues."""
-    q, values = wp.eig3(0.5 * (a + wp.transpose(a)))
-    kept = wp.vec3(wp.max(values[0], 0.0), wp.max(values[1], 0.0), wp.max(values[2], 0.0))
-    return q * wp.diag(kept) * wp.transpose(q)
 
 
 @wp.func

@@ -55,7 +55,7 @@ class TangentOperator:
         self.ranks, self.number = ranks, number
         self.stiff_forces = tuple(stiff_forces)
         self.device, self.worlds = body.device, body.worlds
-        self.tangent = field.tangent(exact=exact)
+        self.tangent = field.tangent(exact=True) if exact else field.definite_tangent()
         self.frame: wp.array | None = None
         self.scales = wp.array([0.0, 0.0, 1.0], dtype=wp.float32, device=self.device)
         self.tension = None if exact else Tension.of(field, self.tangent, body.conditions.mass, self.scales)
