@@ -10,7 +10,7 @@ buffer and writes those of the other: so it ends with one barrier. On CUDA resid
 iterations of a step in one launch.
 """
 
-# ruff: noqa: SIM102 (Warp leaves out a branch if its whole condition is static.)
+# ruff: noqa: SIM102, SIM108 (Warp leaves out a branch if its whole condition is static; a struct is chosen by one.)
 import functools
 from types import SimpleNamespace
 
