@@ -80,8 +80,6 @@ def find_patches(bodies: Sequence[RunBody]) -> None:
     """Find the patches of all bodies of an input; each body gets the loads and probes on its patches."""
     args = bodies[0].args
     probes, loads = list(args.probe or ()), bodies[0].loads
-    if probes and args.csv is None:
-        raise InputError("--probe is for --csv, which is not given")
     for body in bodies:
         gravity = gravity_of(args, body.subject)
         body.patches = BodyPatches(body.subject, up_of(body.subject, gravity), args.patch or ())
@@ -261,9 +259,6 @@ def held_by_default(
 
 # --- ``--remesh`` ----------------------------------------------------------------------------------------------------
 
-#: Options that need ``--remesh``.
-REMESH_OPTIONS = ("refine_above", "simplify_below", "remesh_levels", "remesh_every", "capacity")
-
 
 def remesh_of(args: argparse.Namespace, kind: str) -> OnlineRemesh | None:
     """The remeshing that the options request, None for none.
@@ -276,9 +271,6 @@ def remesh_of(args: argparse.Namespace, kind: str) -> OnlineRemesh | None:
         InputError: An option that is out of its range or has no effect, or a mesh that cannot be remeshed.
     """
     if not args.remesh:
-        for name in REMESH_OPTIONS:
-            if getattr(args, name) is not None:
-                raise InputError(f"--{name.replace('_', '-')} is for --remesh, which is not given")
         return None
     if kind == "tets":
         raise InputError(

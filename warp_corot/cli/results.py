@@ -322,9 +322,6 @@ def check_preview(args: argparse.Namespace) -> None:
         InputError: It cannot.
     """
     if args.preview is None:
-        for name in ("preview_frames", "preview_views"):
-            if getattr(args, name) is not None:
-                raise InputError(f"--{name.replace('_', '-')} is for --preview, which is not given")
         return
     if find_spec("matplotlib") is None:
         raise InputError('--preview needs Matplotlib: pip install "warp-corot[plot]"')
