@@ -169,7 +169,7 @@ def about(args: argparse.Namespace, bodies: Sequence[RunBody]) -> dict[str, Any]
     for number, body in enumerate(bodies, start=1):
         subject, own = body.subject, body.args
         said[f"body{number}"] = of_body = {"name": _text(subject.name), "input": _text(own.input)}
-        of_body["held"] = body.held.words
+        of_body["held"] = body.held_words
         if subject.source is not None:
             of_body["inputSha256"] = _hash(subject.source)
         of_body |= {name: getattr(own, name) for name in ("scale", "unit") if getattr(own, name, None) is not None}
@@ -242,7 +242,7 @@ def summary(
             step += f"; largest stable one at rest about {milliseconds(sim.stable_dt)}{at_last}"
         steps = [("time step", step), *steps, ("speed", speed(done))]
     for body in bodies:
-        lines += [f"{body.subject.name}, {body.held.words}", *aligned(_body_rows(body))]
+        lines += [f"{body.subject.name}, {body.held_words}", *aligned(_body_rows(body))]
     rows = [
         *remesh_rows(sim, done),
         *touched,
@@ -295,7 +295,7 @@ def _body_rows(body: RunBody) -> list[tuple[str, str]]:
         *_mesh_rows(body.subject),
         *_materials(body.subject, body.soft.mesh, body.soft.material),
         ("model", ", ".join(words)),
-        ("fixed", f"{body.held.count} nodes, {body.held.words}" if body.held.count else "nothing"),
+        ("fixed", f"{body.held.sum()} nodes, {body.held_words}" if body.held.any() else "nothing"),
     ]
     return rows + [("" if number else "moved", str(load)) for number, load in enumerate(body.loads)]
 
