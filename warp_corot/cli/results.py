@@ -162,8 +162,7 @@ class DrawnBodies:
         from warp_corot.io.write.skins import BoundSkins
 
         self._joined = joined = JoinedBodies(sim, 0)
-        own = [None if joined.are_cut else body.subject.skin for body in bodies]
-        drawn = [skin or body.subject.surface for body, skin in zip(bodies, own, strict=True)]
+        drawn = [body.subject.drawn(joined.are_cut) for body in bodies]
         self._skins = BoundSkins(joined.meshes, drawn, changing=joined.changing, are_cut=joined.are_cut)
 
     def frame(self, sim: Simulation) -> Picture:

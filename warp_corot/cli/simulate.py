@@ -110,12 +110,8 @@ class Simulated:
             write_run(args.write_run, self._options)
         with WATCH.part("solving"):
             rested = rest(shared, sim)
-        # The smooth surfaces of bodies; without any, tetrahedra are drawn, and of those that are cut the mesh's own.
-        skins = [None if sim.remeshing.are_cut else body.subject.skin for body in bodies]
-        surfaces = [
-            None if body.args.draw_labels else skin or body.subject.surface
-            for body, skin in zip(bodies, skins, strict=True)
-        ]
+        are_cut = sim.remeshing.are_cut
+        surfaces = [None if body.args.draw_labels else body.subject.drawn(are_cut) for body in bodies]
         table: Any = nullcontext()
         if shared.csv:
             table = table_of(shared.csv, sim, self.ready.probes, self.ready.touched.obstacles)
