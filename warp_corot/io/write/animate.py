@@ -17,7 +17,6 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from warp_corot import __version__
 from warp_corot.contact.reading import contact_at_nodes
 from warp_corot.errors import InputError
 from warp_corot.inputs.checks import checked_number, checked_path, shown
@@ -396,6 +395,8 @@ def provenance(sim: Simulation, held: npt.NDArray[np.bool_]) -> dict[str, Any]:
         sim: The simulation.
         held: Which nodes of the drawn body are held.
     """
+    from warp_corot import __version__
+
     models = {}
     for number, model in enumerate(sim.models, start=1):
         options = ", ".join(f"{name}={value!r}" for name, value in vars(model).items() if value is not None)
