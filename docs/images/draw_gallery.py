@@ -57,7 +57,7 @@ def example(script, duration, up_axis="Y", azimuth=35.0, elevation=14.0, **optio
             wc.record = kept
         (sim,) = seen
         bodies = [
-            SimpleNamespace(soft=body, subject=SimpleNamespace(mesh=body.mesh, skin=None, surface=None))
+            SimpleNamespace(soft=body, subject=SimpleNamespace(mesh=body.mesh, drawn=lambda _: None))
             for body in sim.bodies
         ]
         shown = DrawnBodies(bodies, sim).frame(sim)

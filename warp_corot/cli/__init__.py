@@ -14,6 +14,7 @@ import warnings
 from collections.abc import Collection, Sequence
 from importlib import import_module
 from importlib.metadata import version
+from types import ModuleType
 from typing import Any, NoReturn
 
 from warp_corot.errors import InputError, UnstableError
@@ -37,6 +38,11 @@ from .terminal import (
 
 #: Exit statuses of runs that failed, and not by a signal.
 FAILED = (1, 2, 3)
+
+
+def subcommand(name: str) -> ModuleType:
+    """The module that runs a subcommand; it imports the whole package, which takes a while."""
+    return import_module(f".{name.replace('-', '_')}", __name__)
 
 
 class Parser(argparse.ArgumentParser):
@@ -188,7 +194,6 @@ def _run(argv: Sequence[str] | None) -> int:
             from .terminal import begin_compiling
 
             begin_compiling(args.device)
-        # This imports the whole package, which takes a while.
-        module = import_module(f".{args.command.replace('-', '_')}", __name__)
+        module = subcommand(args.command)
     WATCH.switch("preparing")
     return module.run(args)

@@ -14,7 +14,7 @@ from warp_corot.body.soft_body import SoftBody
 from warp_corot.domain.units import pressure
 from warp_corot.elasticity import MODELS, Corotated, Model
 from warp_corot.errors import InputError
-from warp_corot.holding.choice import supports_of
+from warp_corot.holding.choice import Supports, supports_of
 from warp_corot.materials.isotropic import Isotropic
 from warp_corot.remesh.remeshing import OnlineRemesh
 from warp_corot.simulation.parts import checked_gravity
@@ -40,7 +40,9 @@ class RunBody:
         remesh: Its remeshing, if any.
         loads: Its loads.
         patches: Its patches.
-        held: Its fixed nodes.
+        held: Its fixed nodes, mask [N].
+        held_words: Text for the summary: "standing on its lowest 10 %", "free".
+        lies: Whether it needs a ground to lie on.
         soft: The body itself.
         probes: Its probes.
     """
@@ -52,7 +54,9 @@ class RunBody:
     loads: list[Load]
     subject: InputMesh = field(init=False)
     patches: BodyPatches = field(init=False)
-    held: FixedNodes = field(init=False)
+    held: npt.NDArray[np.bool_] = field(init=False)
+    held_words: str = ""
+    lies: bool = False
     soft: SoftBody = field(init=False)
     probes: list[str] = field(default_factory=list)
 
@@ -80,8 +84,6 @@ def find_patches(bodies: Sequence[RunBody]) -> None:
     """Find the patches of all bodies of an input; each body gets the loads and probes on its patches."""
     args = bodies[0].args
     probes, loads = list(args.probe or ()), bodies[0].loads
-    if probes and args.csv is None:
-        raise InputError("--probe is for --csv, which is not given")
     for body in bodies:
         gravity = gravity_of(args, body.subject)
         body.patches = BodyPatches(body.subject, up_of(body.subject, gravity), args.patch or ())
@@ -109,28 +111,28 @@ def make_body(body: RunBody, duration: float, *, alone: bool) -> None:
         expressions = [subject.fix]
     if expressions is None:
         may_lie = alone and not (body.loads or args.no_ground or is_static(args))
-        body.held, stiffer = held_by_default(
-            subject, material, gravity, may_stiffen=chosen is not None, may_lie=may_lie
-        )
+        holds, stiffer = held_by_default(subject, material, gravity, may_stiffen=chosen is not None, may_lie=may_lie)
+        body.held, body.lies = holds.nodes, bool(holds.lies)
+        body.held_words = "lying on a ground" if holds.lies else holds.words
         if stiffer > 1.0:
             material, chosen = _material(args, subject, body.patches, stiffer)
     else:
         moved = any(load.kind != "press" for load in body.loads)
-        nodes = np.logical_or.reduce([body.patches.nodes(expression) for expression in expressions])
+        nodes = body.held = np.logical_or.reduce([body.patches.nodes(expression) for expression in expressions])
         said = " or ".join(expressions)
         if nodes.sum() == len(subject.used):
             raise InputError(f"expression {said!r}: holds all {nodes.sum()} nodes; at least one must be free to move")
         if not nodes.any() and not (moved or free):
             subject.notes.append(f"no node is held ({said!r}): the body falls freely")
-        body.held = FixedNodes(nodes, f"held where {said}" if nodes.any() else "free, nothing is held")
+        body.held_words = f"held where {said}" if nodes.any() else "free, nothing is held"
         if free:
             subject.notes.append("the ground carries the body, and nothing is fixed (--fix)")
     if chosen is not None:
         rest = " of the others" if subject.labels else ""
         subject.notes.append(f"Young's modulus{rest} is {pressure(chosen)}, chosen for the weight (--young)")
     body.soft = SoftBody(subject.mesh, material, device=args.device, threads=args.threads)
-    body.soft.fix(body.held.nodes)
-    fixed = None if args.fix is None else body.held.nodes
+    body.soft.fix(body.held)
+    fixed = None if args.fix is None else body.held
     move_patches(body.soft, body.loads, body.patches, ramp_of(args, duration), fixed)
     if args.ramp is not None and args.ramp > duration:
         share = duration / args.ramp
@@ -196,28 +198,9 @@ def _material(
 MORE = 1.05
 
 
-@dataclass(frozen=True, eq=False)
-class FixedNodes:
-    """The fixed nodes.
-
-    Attributes:
-        nodes: Mask bool [N].
-        words: Text for the summary: "standing on its lowest 10 %", "free".
-        lies: Whether the body needs a ground to lie on.
-    """
-
-    nodes: npt.NDArray[np.bool_]
-    words: str
-    lies: bool = False
-
-    @property
-    def count(self) -> int:
-        return int(self.nodes.sum())
-
-
 def held_by_default(
     subject: InputMesh, material: Isotropic, gravity: npt.NDArray[np.float64], *, may_stiffen: bool, may_lie: bool
-) -> tuple[FixedNodes, float]:
+) -> tuple[Supports, float]:
     """The support of the body, and a factor on its stiffness: above one if no patch would support it with its present
     stiffness.
 
@@ -240,29 +223,25 @@ def held_by_default(
         subject.notes.append(
             f"the body lies on a ground, since {holds.lies}, and nothing is fixed (--no-ground or --fix holds it)"
         )
-        return FixedNodes(holds.nodes, "lying on a ground", lies=True), 1.0
+        return holds, 1.0
     lines = holds.reasons()
     subject.notes += [*lines[:-1], f"{lines[-1]} (--fix chooses others)"]
-    held = FixedNodes(holds.nodes, holds.words)
     if not (1.0 < holds.stiffer < np.inf):
-        return held, 1.0
+        return holds, 1.0
     if may_stiffen:
         subject.notes.append(
             f"it is {holds.stiffer:.2g} times as stiff as the default for its weight, so that this supports it"
         )
-        return held, MORE * holds.stiffer
+        return holds, MORE * holds.stiffer
     sag = max(hold.sag for hold in holds.pieces)
     subject.notes.append(
         f"the body is so soft that it sags by about {sag:.0%} of its height; make it {holds.stiffer:.2g} times as "
         "stiff (--young), or fix more of it (--fix)"
     )
-    return held, 1.0
+    return holds, 1.0
 
 
 # --- ``--remesh`` ----------------------------------------------------------------------------------------------------
-
-#: Options that need ``--remesh``.
-REMESH_OPTIONS = ("refine_above", "simplify_below", "remesh_levels", "remesh_every", "capacity")
 
 
 def remesh_of(args: argparse.Namespace, kind: str) -> OnlineRemesh | None:
@@ -276,9 +255,6 @@ def remesh_of(args: argparse.Namespace, kind: str) -> OnlineRemesh | None:
         InputError: An option that is out of its range or has no effect, or a mesh that cannot be remeshed.
     """
     if not args.remesh:
-        for name in REMESH_OPTIONS:
-            if getattr(args, name) is not None:
-                raise InputError(f"--{name.replace('_', '-')} is for --remesh, which is not given")
         return None
     if kind == "tets":
         raise InputError(

@@ -242,7 +242,7 @@ def place_ground(touched: RunContact, args: argparse.Namespace, bodies: Sequence
     """
     if args.touch and len(bodies) == 1:
         raise InputError("--touch is for several bodies, and there is one (--self-contact is for one body)")
-    if args.ground is None and args.drop is None and not any(body.held.lies for body in bodies):
+    if args.ground is None and args.drop is None and not any(body.lies for body in bodies):
         return
     touched.contact = touched.contact or Contact()
     up = up_of(bodies[0].subject, gravity)

@@ -24,7 +24,7 @@ from warp_corot.io.read.meshes import (
     read_file,
 )
 
-from .options import TETS
+from .options import NEEDS, TETS
 
 
 @dataclass
@@ -161,6 +161,9 @@ def refuse_options(args: argparse.Namespace, opened: InputFile) -> None:
     Raises:
         InputError: An option has none; the message names it and its purpose.
     """
+    for name, needed in NEEDS.items():
+        if getattr(args, name) is not None and not getattr(args, needed):
+            raise InputError(f"--{name.replace('_', '-')} is for --{needed}, which is not given")
     is_scan = opened.kind == "scan"
     regions = opened.found is not None and any(block.data for block in opened.found.solids)
     is_organ, is_forest = opened.kind in ("surface", "scan"), opened.kind != "tets"

@@ -98,6 +98,10 @@ class InputMesh:
         lowest, highest = self.bounds[:, "XYZ".index(self.mesh.up_axis)]
         return float(highest - lowest)
 
+    def drawn(self, are_cut: bool = False) -> OwnSurface | SurfaceMesh | None:
+        """The user's own surface, unless the body can be cut, or the smooth one; None: that of its tetrahedra."""
+        return self.surface if are_cut or self.skin is None else self.skin
+
     def take(self, asset: Asset, args: argparse.Namespace) -> None:
         """Use an asset's defaults, as far as they suit the options: its fixed nodes support a body of its size
         that is at least as stiff as the asset."""

@@ -359,6 +359,10 @@ OF_THE_RUN = tuple(
 )
 
 
+#: Options that need another one.
+NEEDS = dict.fromkeys(("refine_above", "simplify_below", "remesh_levels", "remesh_every", "capacity"), "remesh")
+NEEDS |= {"preview_frames": "preview", "preview_views": "preview", "probe": "csv", "blade_length": "blade"}
+
 # --- the commands ----------------------------------------------------------------------------------------------------
 
 PATCHES = """patches, for --fix, --pull, --press, --twist and --probe, are expressions:

@@ -162,8 +162,7 @@ class DrawnBodies:
         from warp_corot.io.write.skins import BoundSkins
 
         self._joined = joined = JoinedBodies(sim, 0)
-        own = [None if joined.are_cut else body.subject.skin for body in bodies]
-        drawn = [skin or body.subject.surface for body, skin in zip(bodies, own, strict=True)]
+        drawn = [body.subject.drawn(joined.are_cut) for body in bodies]
         self._skins = BoundSkins(joined.meshes, drawn, changing=joined.changing, are_cut=joined.are_cut)
 
     def frame(self, sim: Simulation) -> Picture:
@@ -322,9 +321,6 @@ def check_preview(args: argparse.Namespace) -> None:
         InputError: It cannot.
     """
     if args.preview is None:
-        for name in ("preview_frames", "preview_views"):
-            if getattr(args, name) is not None:
-                raise InputError(f"--{name.replace('_', '-')} is for --preview, which is not given")
         return
     if find_spec("matplotlib") is None:
         raise InputError('--preview needs Matplotlib: pip install "warp-corot[plot]"')

@@ -188,8 +188,6 @@ def make_simulation(args: argparse.Namespace, bodies: Sequence[RunBody], touched
         tried = min(_tried_step(body, damping, viscosity) for body in bodies)
         steps = steps_per_frame(args.fps, args.dt or tried)  # refuses an excessive number
         integrator = SymplecticEuler(None if args.dt is None else 1.0 / (args.fps * steps), damping, viscosity)
-    if not args.blade and args.blade_length is not None:
-        raise InputError("--blade-length is for --blade, which is not given")
     for body in bodies if args.blade else ():
         kept = "--skin input" if body.args.skin == "input" else "--draw-labels" if body.args.draw_labels else None
         if kept:

@@ -110,12 +110,8 @@ class Simulated:
             write_run(args.write_run, self._options)
         with WATCH.part("solving"):
             rested = rest(shared, sim)
-        # The smooth surfaces of bodies; without any, tetrahedra are drawn, and of those that are cut the mesh's own.
-        skins = [None if sim.remeshing.are_cut else body.subject.skin for body in bodies]
-        surfaces = [
-            None if body.args.draw_labels else skin or body.subject.surface
-            for body, skin in zip(bodies, skins, strict=True)
-        ]
+        are_cut = sim.remeshing.are_cut
+        surfaces = [None if body.args.draw_labels else body.subject.drawn(are_cut) for body in bodies]
         table: Any = nullcontext()
         if shared.csv:
             table = table_of(shared.csv, sim, self.ready.probes, self.ready.touched.obstacles)
@@ -169,7 +165,7 @@ def about(args: argparse.Namespace, bodies: Sequence[RunBody]) -> dict[str, Any]
     for number, body in enumerate(bodies, start=1):
         subject, own = body.subject, body.args
         said[f"body{number}"] = of_body = {"name": _text(subject.name), "input": _text(own.input)}
-        of_body["held"] = body.held.words
+        of_body["held"] = body.held_words
         if subject.source is not None:
             of_body["inputSha256"] = _hash(subject.source)
         of_body |= {name: getattr(own, name) for name in ("scale", "unit") if getattr(own, name, None) is not None}
@@ -242,7 +238,7 @@ def summary(
             step += f"; largest stable one at rest about {milliseconds(sim.stable_dt)}{at_last}"
         steps = [("time step", step), *steps, ("speed", speed(done))]
     for body in bodies:
-        lines += [f"{body.subject.name}, {body.held.words}", *aligned(_body_rows(body))]
+        lines += [f"{body.subject.name}, {body.held_words}", *aligned(_body_rows(body))]
     rows = [
         *remesh_rows(sim, done),
         *touched,
@@ -295,7 +291,7 @@ def _body_rows(body: RunBody) -> list[tuple[str, str]]:
         *_mesh_rows(body.subject),
         *_materials(body.subject, body.soft.mesh, body.soft.material),
         ("model", ", ".join(words)),
-        ("fixed", f"{body.held.count} nodes, {body.held.words}" if body.held.count else "nothing"),
+        ("fixed", f"{body.held.sum()} nodes, {body.held_words}" if body.held.any() else "nothing"),
     ]
     return rows + [("" if number else "moved", str(load)) for number, load in enumerate(body.loads)]
 

@@ -46,7 +46,7 @@ def run(args: argparse.Namespace) -> int:
         host=args.host,
         port=args.port,
         token=args.token,
-        own=[body.subject.skin or body.subject.surface for body in ready.bodies],
+        own=[body.subject.drawn() for body in ready.bodies],
         made=lambda sim: _carry_over(ready, asked[0], sim),
         run_file=lambda sim: run_text(asked, sim),
         title=names_of(ready.bodies),  # stiffness and weight may change on the page

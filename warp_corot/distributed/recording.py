@@ -176,14 +176,8 @@ class _Pieces:
             prim.referenceList.Prepend(Sdf.Reference(f"./{self._folder.name}/{_name(rank)}"))
         layer.customLayerData = {"warp_corot": {"ranks": self._comm.size}}
         with written_whole(self._path) as part:
-            # OpenUSD finds the format by the extension.
-            aside = part.with_name(part.name + self._path.suffix)
-            try:
-                if not layer.Export(str(aside)):
-                    raise OSError(f"{self._path}: cannot be written")
-                aside.replace(part)
-            finally:
-                aside.unlink(missing_ok=True)
+            if not layer.Export(str(part)):
+                raise OSError(f"{self._path}: cannot be written")
 
 
 def _name(rank: int) -> str:

@@ -217,10 +217,10 @@ def split_solids(
             # Cones from the lowest node over the triangles of the faces without it.
             nodes, outsides = block.nodes, OUTSIDES[block.kind]
             parts = [nodes[:, None, face] if len(face) == 3 else _halves(nodes[:, face]) for face in outsides]
-            triangles, apex = np.concatenate(parts, axis=1), nodes.min(axis=1)[:, None, None]
-            away = (triangles != apex).all(axis=2)
-            cones = np.concatenate([triangles, np.broadcast_to(apex, (*triangles.shape[:2], 1))], axis=2)
-            made, whose = cones[away], np.nonzero(away)[0]
+            triangles, lowest = np.concatenate(parts, axis=1), nodes.min(axis=1)
+            away = (triangles != lowest[:, None, None]).all(axis=2)
+            whose = np.nonzero(away)[0]
+            made = np.concatenate([triangles[away], lowest[whose, None]], axis=1)
             made, folded = _wound_alike(made, whose, len(block.nodes), points)
             warped += folded
             whole = (np.diff(np.sort(made, axis=1), axis=1) > 0).all(axis=1)

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
+from importlib.metadata import PackageNotFoundError, version
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,7 +18,6 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from warp_corot import __version__
 from warp_corot.contact.reading import contact_at_nodes
 from warp_corot.errors import InputError
 from warp_corot.inputs.checks import checked_number, checked_path, shown
@@ -396,13 +396,17 @@ def provenance(sim: Simulation, held: npt.NDArray[np.bool_]) -> dict[str, Any]:
         sim: The simulation.
         held: Which nodes of the drawn body are held.
     """
+    try:
+        number = version("warp-corot")
+    except PackageNotFoundError:
+        number = "(not installed)"
     models = {}
-    for number, model in enumerate(sim.models, start=1):
+    for k, model in enumerate(sim.models, start=1):
         options = ", ".join(f"{name}={value!r}" for name, value in vars(model).items() if value is not None)
-        models[f"body{number}"] = f"{type(model).__name__}({options})"
+        models[f"body{k}"] = f"{type(model).__name__}({options})"
     integrator = {name: value for name, value in asdict(sim.integrator).items() if value is not None}  # type: ignore
     return {
-        "program": f"warp_corot {__version__}, warp {wp.__version__}",
+        "program": f"warp_corot {number}, warp {wp.__version__}",
         "units": "metres, kilograms, seconds, pascals",
         "device": f"{sim.device} ({sim.device.name})",
         "models": models,
