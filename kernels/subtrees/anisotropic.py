@@ -13,9 +13,7 @@ import warp as wp
 from warp_corot.kernels.clusters.laws import ActiveMaterial
 from warp_corot.kernels.corotated.anisotropic import FibreMaterial, fibre_stress, filled
 from warp_corot.kernels.corotated.well_conditioned import definite_law, definite_strain, is_definite, load_axes
-from warp_corot.kernels.elements.elements import ForestElements
-from warp_corot.kernels.elements.forces import scatter_chosen
-from warp_corot.kernels.math.rotation import ITERATIONS, byers_xu, column, identity3, newton_rotation, quick_rotation
+from warp_corot.kernels.math.rotation import ITERATIONS, byers_xu, column, identity3, newton_rotation
 
 from .cuda import scatter_subtrees
 from .degenerate import repair_flagged
@@ -80,4 +78,3 @@ def scatter_anisotropic_subtrees(
 
 
 repair_leaves = repair_flagged(FibreMaterial, fibre_stress(byers_xu))
-scatter_flat = scatter_chosen(ForestElements, FibreMaterial, fibre_stress(quick_rotation))

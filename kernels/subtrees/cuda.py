@@ -93,7 +93,7 @@ def scatter_subtrees(
         Material: The struct that the law reads.
         missed: "": the law leaves no leaf out; "flags": left-out leaves are flagged; "list": and their subtrees listed.
         resident: The number of blocks for which a multiprocessor's registers must have room; 0: any.
-        turn: The policy of rotations (``forces``); with shared ones a subtree is left out whole, and listed by itself.
+        turn: The policy of rotations (``forces``); with shared ones a subtree is left out whole.
     """
     load, add = memory_of(shape, grouped)
     forces = subtree_forces(shape, uniform, leaves)
@@ -126,8 +126,8 @@ def scatter_subtrees(
             reserved = reserve(degenerate, list_of(s // BLOCK), mask != 0, subtrees.code.shape[0] - s)
         add(subtrees, s, turn_out(g, r0, r1, r2), f)
         if wp.static(listed):
-            place = wp.where(wp.static(own), subtrees.first[s], s)
-            append(degenerate, list_of(s // BLOCK), reserved, place, mask, subtrees.code.shape[0] - s)
+            to_come = subtrees.code.shape[0] - s
+            append(degenerate, list_of(s // BLOCK), reserved, subtrees.first[s], mask, to_come)
 
     return scatter_subtrees
 
@@ -151,10 +151,10 @@ def scatter_dilatation(shape: int, grouped: bool, uniform: bool, of: Dilatation)
     )
 
 
-def scatter_subtrees_shared(shape: int, grouped: bool, uniform: bool, given: bool, listed: bool) -> wp.Kernel:
+def scatter_subtrees_shared(shape: int, grouped: bool, uniform: bool, given: bool) -> wp.Kernel:
     """Corotated forces of subtrees whose leaves share a rotation: that of the subtree's root, or a given one."""
     leaves, turn = isotropic_leaves(shape, always_trusted(law_functions("linear").stress)), shared_turn(shape, given)
-    missed, resident = ("", 0) if given else ("list" if listed else "flags", 7)
+    missed, resident = ("", 0) if given else ("flags", 7)
     options: dict[str, Any] = {"missed": missed, "resident": resident, "turn": turn}
     return scatter_subtrees(shape, grouped, uniform, leaves, RotatedMaterial, **options)
 

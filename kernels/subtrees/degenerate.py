@@ -49,7 +49,7 @@ class DegenerateList:
     # The lengths of the lists, a cache line apart, then the number of blocks that are done; zero between evaluations.
     counts: wp.array[wp.int32]  # [(LISTS + 1) COUNT_STRIDE]
     room: int  # capacity of a list
-    entries: wp.array[wp.vec2i]  # [LISTS room] first leaf of the subtree (own rotations) or the subtree, and its mask
+    entries: wp.array[wp.vec2i]  # [LISTS room] first leaf of the subtree, and its mask
 
 
 #: The argument of kernels that write no list.
@@ -187,10 +187,9 @@ def leaves_of_entries(lists: DegenerateList, begin: int, entries: int, k: int) -
 # Forces of the leaves that the subtree kernels left out, mostly flat or inverted ones, with a rotation that is right
 # for every F.
 #
-# A byte for each subtree, with a bit for each leaf, says which these are. On CUDA the subtrees that have any are in
-# lists (``DegenerateList``), which one launch of a fixed size processes. On the CPU, and where sums must have a fixed
-# order, a thread reads the bytes of eight subtrees at a time, which are nearly always all zero, and processes their
-# leaves in order.
+# A byte for each subtree, with a bit for each leaf, says which these are. Those of a whole body on CUDA are also in
+# lists (``DegenerateList``), which one launch of a fixed size processes. Elsewhere threads read the bytes of eight
+# subtrees at a time, which are nearly always all zero; one thread, or one for each of the eight, adds their leaves.
 
 
 #: Number of subtrees that one thread processes; the length of ``flagged`` is a multiple of it.
@@ -307,42 +306,6 @@ def repair_listed_own(
     leave(listed, threads // LIST_BLOCK)
 
 
-@unique_kernel(grid_stride=False)
-def repair_listed_shared(
-    # In
-    threads: int,
-    first: wp.array[wp.int32],
-    code: wp.array[wp.int32],
-    places: wp.array2d[wp.vec2i],
-    elements: ForestElements,
-    material: IsotropicMaterial,
-    u: wp.array[wp.vec4],
-    # In and out
-    listed: DegenerateList,
-    # Out
-    f: wp.array[wp.vec4],
-):
-    """Add the forces of all leaves of listed subtrees with the rotation of the subtree's root, a thread a leaf.
-
-    Launch it like ``repair_listed_own``.
-    """
-    if not any_degenerate(listed):
-        return
-    at_a_time = wp.min(threads, LISTS)
-    list = wp.tid() % at_a_time
-    each_list = (threads - list + at_a_time - 1) // at_a_time
-    while list < LISTS:
-        i = wp.tid() // at_a_time
-        while i < entry_count(listed, list) * LEAVES:
-            s = listed.entries[listed.room * list + i // LEAVES][0]
-            t = first[s] + i % LEAVES
-            r = root_rotation(elements, places, first[s], code[s], u)
-            scatter_turned(elements, t, r, material, u, f)
-            i += each_list
-        list += at_a_time
-    leave(listed, threads // LIST_BLOCK)
-
-
 # --- by bytes, in order ---------------------------------------------------------------------------------------------
 
 
@@ -402,6 +365,7 @@ def turn_listed(
 @unique_kernel()
 def repair_shared(
     # In
+    lanes: int,
     flagged: wp.array[wp.uint64],
     first: wp.array[wp.int32],
     code: wp.array[wp.int32],
@@ -412,22 +376,20 @@ def repair_shared(
     # Out
     f: wp.array[wp.vec4],
 ):
-    """Add the forces of flagged leaves, each with the rotation of its subtree's root."""
-    i = wp.tid()
+    """Add the forces of flagged subtrees, all leaves of each with the rotation of its root; see ``repair_flagged``."""
+    i = wp.tid() // lanes
     flags = flagged[i]
     if flags == wp.uint64(0):
         return
-    member = int(0)
-    while member < SUBTREES:
-        if is_degenerate(flags, LEAVES * member):
-            s = SUBTREES * i + member
-            rotation = root_rotation(elements, places, first[s], code[s], u)
-            leaf = int(0)
-            while leaf < LEAVES:
-                t = first[s] + leaf
-                scatter_turned(elements, t, rotation, material, u, f)
-                leaf += 1
-        member += 1
+    leaf = wp.tid() % lanes
+    rotation = wp.mat33()
+    while leaf < SUBTREES * LEAVES:
+        if is_degenerate(flags, leaf):
+            s = SUBTREES * i + leaf // LEAVES
+            if lanes > 1 or leaf % LEAVES == 0:
+                rotation = root_rotation(elements, places, first[s], code[s], u)
+            scatter_turned(elements, first[s] + leaf % LEAVES, rotation, material, u, f)
+        leaf += lanes
 
 
 #: Of corotated leaves with own rotations.

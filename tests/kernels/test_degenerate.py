@@ -13,7 +13,7 @@ from degenerate_launches import Launches
 
 import warp_corot as wc
 from warp_corot.discretization.planner import ForcePlan
-from warp_corot.elasticity.corotated.launches import DegenerateLeaves
+from warp_corot.elasticity.cuda import DegenerateLeaves
 from warp_corot.elasticity.model import isotropic_material
 from warp_corot.kernels.subtrees.degenerate import COUNT_STRIDE, LISTS
 
@@ -52,7 +52,7 @@ def test_listed_leaves_get_their_forces(share, uniform, device, rng):
         error = np.abs(launches.forces() - forces)[valid].max()
         assert error < TOLERANCE * np.abs(forces).max()
         assert (launches.count > 0) == (share > 0)
-        assert (launches.listed.own.counts.numpy() == 0).all()
+        assert (launches.listed.lists.counts.numpy() == 0).all()
 
 
 def test_whole_subtrees_get_their_forces(device, rng):
@@ -110,16 +110,16 @@ def test_every_leaf_may_be_listed(share, device, rng):
     u = np.where(far, 1.0, 0.08) * edge_scale(forest) * rng.uniform(-1, 1, forest.points.shape)
     body.displacements = u
     plan = ForcePlan.of_forest(forest, None, body.device, grouped=False)
-    listed = DegenerateLeaves.of(plan, body.device)
+    listed = DegenerateLeaves([*(batch.count for batch in plan.batches), len(plan.flat)], body.device)
     # Distributed to lists of different lengths, some of them empty.
     (batch,) = plan.batches
-    counts, entries = listed.own.counts.numpy(), listed.own.entries.numpy().reshape(LISTS, listed.own.room, 2)
+    counts, entries = listed.lists.counts.numpy(), listed.lists.entries.numpy().reshape(LISTS, listed.lists.room, 2)
     for k, first in enumerate(batch.subtrees.first.numpy()):
         of = k * k % (LISTS - 1)
         entries[of, counts[of * COUNT_STRIDE]] = first, 255
         counts[of * COUNT_STRIDE] += 1
-    listed.own.counts.assign(counts)
-    listed.own.entries.assign(entries.reshape(-1, 2))
+    listed.lists.counts.assign(counts)
+    listed.lists.entries.assign(entries.reshape(-1, 2))
     f = wp.zeros_like(body.state.displacements)
     listed.repair(
         body.discretization.elements,
@@ -129,4 +129,4 @@ def test_every_leaf_may_be_listed(share, device, rng):
     )
     forces, valid = expected(forest, u, young)
     assert np.abs(f.numpy()[:, :3] - forces)[valid].max() < TOLERANCE * np.abs(forces).max()
-    assert (listed.own.counts.numpy()[: LISTS * COUNT_STRIDE] == 0).all()
+    assert (listed.lists.counts.numpy()[: LISTS * COUNT_STRIDE] == 0).all()

@@ -24,9 +24,10 @@ from warp_corot.kernels.corotated.corotated import corotated_stress
 from warp_corot.kernels.corotated.well_conditioned import quaternions_of
 from warp_corot.kernels.elements import constitutive
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial
-from warp_corot.kernels.elements.forces import scatter_forces
+from warp_corot.kernels.elements.elements import ForestElements
+from warp_corot.kernels.elements.forces import scatter_chosen, scatter_forces
 from warp_corot.kernels.math.rotation import byers_xu, quick_rotation
-from warp_corot.kernels.subtrees.anisotropic import repair_leaves, scatter_anisotropic_subtrees, scatter_flat
+from warp_corot.kernels.subtrees.anisotropic import repair_leaves, scatter_anisotropic_subtrees
 from warp_corot.kernels.subtrees.cuda import scatter_law_subtrees
 from warp_corot.kernels.subtrees.degenerate import NO_LIST
 from warp_corot.kernels.subtrees.memory import BLOCK
@@ -142,7 +143,8 @@ def test_anisotropic_subtrees_one_by_one(name, kind, device, rng):
     flat = plan.flat
     if len(flat):
         inputs = [plan.elements, flat.leaves, fibres, on_device]
-        wp.launch(scatter_flat, len(flat), inputs=inputs, outputs=[f], device=device)
+        of_flat = scatter_chosen(ForestElements, FibreMaterial, fibre_stress(quick_rotation))
+        wp.launch(of_flat, len(flat), inputs=inputs, outputs=[f], device=device)
     assert flags < 0.3 * len(mesh.tets)
     assert flags > 0 or name == "mixed levels"
     assert_right(f.numpy()[:, :3], leaf_by_leaf(whole, active, on_device))

@@ -81,7 +81,7 @@ def test_shared_rotations_by_subtrees(leaf_level, amount, device, rng):
     none = wp.empty(0, dtype=wp.mat33, device=body.device), wp.empty(0, dtype=wp.int32, device=body.device)
     material = Kept(RotatedMaterial, *ROTATED)(material, *none)
     wp.launch(
-        scatter_subtrees_shared(batch.shape, False, True, False, False),
+        scatter_subtrees_shared(batch.shape, False, True, False),
         dim=batch.count,
         inputs=[batch.subtrees, material, body.state.displacements],
         outputs=[f, batch.flagged, DegenerateList()],

@@ -4,7 +4,7 @@ import numpy as np
 import warp as wp
 
 from warp_corot.discretization.planner import ForcePlan
-from warp_corot.elasticity.corotated.launches import DegenerateLeaves
+from warp_corot.elasticity.cuda import DegenerateLeaves
 from warp_corot.elasticity.model import isotropic_material
 from warp_corot.kernels.subtrees.cuda import FLAT, WorkRange, scatter_body
 from warp_corot.kernels.subtrees.memory import BLOCK
@@ -16,7 +16,7 @@ class Launches:
     def __init__(self, body):
         self.body, self.device = body, body.device
         self.plan = plan = ForcePlan.of_forest(body.mesh, None, body.device, grouped=False)
-        self.listed = DegenerateLeaves.of(plan, body.device)
+        self.listed = DegenerateLeaves([*(batch.count for batch in plan.batches), len(plan.flat)], body.device)
         self.rows, self.blocks = [], 0
         for batch in plan.batches:
             if self.device.is_cpu:
@@ -49,10 +49,10 @@ class Launches:
                 material,
                 body.state.displacements,
             ],
-            outputs=[f, self.listed.own],
+            outputs=[f, self.listed.lists],
             device=self.device,
             block_dim=BLOCK,
         )
-        self.count = int(self.listed.own.counts.numpy().sum())
+        self.count = int(self.listed.lists.counts.numpy().sum())
         self.listed.repair(body.discretization.elements, material, body.state.displacements, f)
         return f.numpy()[:, :3]

@@ -23,8 +23,8 @@ from warp_corot.mesh import TetForest
 from warp_corot.solvers.implicit.multigrid import Multigrid
 from warp_corot.solvers.implicit.multigrid.level import Level, SmoothedLevel
 from warp_corot.solvers.implicit.multigrid.multigrid import MOST_DENSE
-from warp_corot.solvers.implicit.operator import LinearOperator
 from warp_corot.solvers.implicit.preconditioners import Seen
+from warp_corot.solvers.implicit.tangent import TangentOperator
 
 from .divided_mesh import DividedMesh
 from .exchange import ExchangeLists, Places, in_worlds
@@ -152,7 +152,7 @@ class MultigridOfParts(Multigrid):
         everywhere = None if members is None else self._members_everywhere
         super().__init__(ranks.owned(part).whole, degree=degree, members=everywhere, **options)
 
-    def update_finest(self, operator: LinearOperator) -> None:
+    def update_finest(self, operator: TangentOperator) -> None:
         ranks, k = self._ranks, self._k
         wp.copy(self._inverse_mass, operator.inverse_mass)
         ranks.exchange(k, self._inverse_mass)

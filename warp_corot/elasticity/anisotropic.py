@@ -10,12 +10,11 @@ import warp as wp
 
 from warp_corot.discretization.discretization import Discretization, discretization_of
 from warp_corot.discretization.plan import Plan
-from warp_corot.elasticity.clusters import divided
 from warp_corot.elasticity.cpu import SimdForces
+from warp_corot.elasticity.cuda import CudaForces, CudaLaw, no_subtrees
 from warp_corot.elasticity.dilatation import AUTO, bind_law, check_dilatation
 from warp_corot.elasticity.model import ElementField, ForceField, Kept, Model
 from warp_corot.errors import InputError
-from warp_corot.inputs.loading import LoadedKernel
 from warp_corot.kernels.clusters.laws import ActiveMaterial, anisotropic_law, reinforced_law
 from warp_corot.kernels.corotated.anisotropic import (
     REINFORCED,
@@ -33,9 +32,7 @@ from warp_corot.kernels.elements.dilatation import LOG_VOLUME
 from warp_corot.kernels.elements.forces import element_energies
 from warp_corot.kernels.elements.simd8 import FIBRES, ORTHOTROPIC
 from warp_corot.kernels.math.rotation import byers_xu, quick_rotation
-from warp_corot.kernels.subtrees.anisotropic import repair_leaves, scatter_anisotropic_subtrees, scatter_flat
-from warp_corot.kernels.subtrees.degenerate import NO_LIST
-from warp_corot.kernels.subtrees.memory import BLOCK
+from warp_corot.kernels.subtrees.anisotropic import repair_leaves, scatter_anisotropic_subtrees
 from warp_corot.kernels.tables.cluster_layout import ANISOTROPIC
 from warp_corot.materials.anisotropic import FibreReinforced, TransverselyIsotropic
 
@@ -80,6 +77,10 @@ class FibreField(ElementField):
             self.launch(kernel, self.element_count, [self.elements, self.fibres, u], [energies])
 
 
+#: Members of ``ActiveMaterial`` as the launches give them.
+ACTIVE = "passive", "axes", "is_active", "activation"
+
+
 class AnisotropicField(FibreField):
     """W = V/2 e : C : e with e = sym(R^T F) - I, R the element's own rotation, C fixed in rest space.
 
@@ -92,8 +93,8 @@ class AnisotropicField(FibreField):
     both momenta. It does work, and has no energy.
 
     The stiffness is exact, with the derivative of R, at the present active stress; it is bounded if the rotation of F
-    is ill-defined (``kernels.corotated.tangent``). On the CPU eight subtrees or elements are computed at a time, unless
-    the model asks for other rotations.
+    is ill-defined (``kernels.corotated.tangent``). On the CPU eight subtrees or elements are computed at a time, on
+    CUDA subtrees and clusters if sums may have any order, unless the model asks for other rotations.
 
     Args:
         discretization: A discretization with an ``Anisotropic`` material.
@@ -102,7 +103,7 @@ class AnisotropicField(FibreField):
     """
 
     def __init__(self, discretization: Discretization, rotation: wp.Function, deterministic: bool):
-        self._quick = rotation is quick_rotation and discretization.device.is_cpu
+        self._quick = rotation is quick_rotation and not (deterministic and discretization.device.is_cuda)
         super().__init__(
             discretization,
             stress=fibre_stress(rotation),
@@ -113,11 +114,40 @@ class AnisotropicField(FibreField):
             deterministic=deterministic,
         )
         if self._quick:
-            law, robust = (lambda: self.fibres), fibre_stress(byers_xu)
-            self._simd = SimdForces(discretization, self.plan, ORTHOTROPIC, law, FibreMaterial, robust)
+            stress, robust = self._functions[0], fibre_stress(byers_xu)
+            if self.device.is_cpu:
+                given = discretization, self.plan, ORTHOTROPIC, lambda: self.fibres
+                self._fast = SimdForces(*given, FibreMaterial, robust)
+            else:
+                self._fast = CudaForces(self, self._cuda_law(stress))
+                self.derive()
+
+    def _cuda_law(self, stress: wp.Function) -> CudaLaw:
+        """The law of subtrees and clusters, which read the axes as quaternions."""
+        transverse = isinstance(self.discretization.material, TransverselyIsotropic)
+        one_axes, one_stiffness = self.passive.axes_stride == 0, self.passive.stride == 0
+        active = Kept(ActiveMaterial, *ACTIVE)
+        self._quaternions = wp.empty(len(self.passive.axes), dtype=wp.quat, device=self.device)
+        return CudaLaw(
+            stress,
+            lambda: self.fibres,
+            FibreMaterial,
+            lambda shape, grouped, _: scatter_anisotropic_subtrees(shape, grouped, transverse, one_axes, one_stiffness),
+            anisotropic_law(transverse),
+            lambda _: active(self.passive, self._quaternions, *self._activation),
+            ActiveMaterial,
+            ANISOTROPIC,
+            repair_leaves,
+        )
+
+    def derive(self) -> None:
+        super().derive()
+        if self._quick and self.device.is_cuda:
+            self.launch(quaternions_of, len(self._quaternions), [self.passive.axes], [self._quaternions])
 
     def plan_of(self, discretization: Discretization) -> Plan:
-        return discretization.plan(subtrees=self._quick, deterministic=self.deterministic)
+        subtrees = self._quick and (self.device.is_cpu or discretization.prefers_subtrees)
+        return discretization.plan(subtrees=subtrees, deterministic=self.deterministic)
 
     @property
     def material(self) -> FibreMaterial:
@@ -126,67 +156,6 @@ class AnisotropicField(FibreField):
     @property
     def material_shown(self) -> FibreMaterial:
         return self.fibres
-
-
-# --- on CUDA: subtrees, clusters, and elements one by one ------------------------------------------------------------
-
-
-#: The fields of ``ActiveMaterial``.
-ACTIVE = ("passive", "axes", "is_active", "activation")
-
-
-class AnisotropicCudaField(AnisotropicField):
-    """Complete subtrees in batches; other elements one by one or, if the mesh never changes, in clusters. Forces may be
-    summed in any order.
-
-    Args:
-        discretization: A mesh with an ``Anisotropic`` material, on CUDA.
-    """
-
-    def __init__(self, discretization: Discretization):
-        super().__init__(discretization, quick_rotation, deterministic=False)
-        self._transverse = isinstance(discretization.material, TransverselyIsotropic)
-        self._active = Kept(ActiveMaterial, *ACTIVE)
-        self._quaternions = wp.empty(len(self.passive.axes), dtype=wp.quat, device=self.device)
-        self.derive()
-        self.follow()
-
-    _force_kernels: list[LoadedKernel] = []  # noqa: RUF012 (never changed)
-
-    def plan_of(self, discretization: Discretization) -> Plan:
-        return discretization.plan(subtrees=discretization.prefers_subtrees)
-
-    def load_kernels(self) -> None:
-        for shape, grouped, _sharing in self.plan.kinds:
-            wp.load_module(self._kernel(shape, grouped).module, self.device, block_dim=BLOCK)
-        for kernel in (scatter_flat, repair_leaves):
-            wp.load_module(kernel.module, self.device)
-
-    def derive(self) -> None:
-        self.launch(quaternions_of, len(self._quaternions), [self.passive.axes], [self._quaternions])
-
-    def scatter_forces(self, u: wp.array, f: wp.array) -> None:
-        fibres, flat = self.fibres, self.plan.flat
-        active = self._active(self.passive, self._quaternions, *self._activation)
-        for batch, kernel in zip(self._batches, self._kernels, strict=True):
-            inputs, outputs = [batch.subtrees, active, u], [f, batch.flagged, NO_LIST]
-            wp.launch(kernel, batch.count, inputs=inputs, outputs=outputs, device=self.device, block_dim=BLOCK)
-            flags = batch.flags_by_eights
-            inputs = [8, flags, batch.subtrees.first, self.elements, fibres, u]
-            self.launch(repair_leaves, 8 * len(flags), inputs, [f])
-        if self._clusters is not None:
-            self._clusters(active, u, f)
-        elif len(flat):
-            self.launch(scatter_flat, len(flat), [self.elements, flat.leaves, fibres, u], [f])
-
-    def follow(self) -> None:
-        law = anisotropic_law(self._transverse)
-        self._batches, self._clusters = divided(self.discretization, self.plan, law, ActiveMaterial, ANISOTROPIC)
-        self._kernels = [self._kernel(batch.shape, batch.grouped) for batch in self._batches]
-
-    def _kernel(self, shape: int, grouped: bool) -> wp.Kernel:
-        one_axes, one_stiffness = self.passive.axes_stride == 0, self.passive.stride == 0
-        return scatter_anisotropic_subtrees(shape, grouped, self._transverse, one_axes, one_stiffness)
 
 
 # --- the law of Holzapfel, Gasser and Ogden, for tissue with families of fibres --------------------------------------
@@ -233,25 +202,19 @@ class ReinforcedField(FibreField):
             Material=ReinforcedMaterial,
             deterministic=deterministic,
         )
-        _, self._clusters = divided(discretization, self.plan, reinforced_law, ReinforcedMaterial)
         self._made, self._shown = (
             Kept(ReinforcedMaterial, "matrix", "fibres", "is_active", "activation") for _ in range(2)
         )
         if self.device.is_cpu:
-            self._simd = SimdForces(discretization, self.plan, FIBRES, lambda: self.material, ReinforcedMaterial)
+            given = discretization, self.plan, FIBRES, lambda: self.material
+            self._fast = SimdForces(*given, ReinforcedMaterial)
+        else:
+            leaves = REINFORCED.stress, lambda: self.material, ReinforcedMaterial
+            law = CudaLaw(*leaves, no_subtrees, reinforced_law, FastMaterial=ReinforcedMaterial)
+            self._fast = CudaForces(self, law)
 
     def plan_of(self, discretization: Discretization) -> Plan:
         return discretization.plan(subtrees=self.device.is_cpu, deterministic=self.deterministic)
-
-    @property
-    def _force_kernels(self) -> list[LoadedKernel]:
-        return super()._force_kernels if self._clusters is None else [self._clusters.kernel]
-
-    def scatter_forces(self, u: wp.array, f: wp.array) -> None:
-        if self._clusters is not None:
-            self._clusters(self.material, u, f)
-        else:
-            super().scatter_forces(u, f)
 
     @property
     def material(self) -> ReinforcedMaterial:

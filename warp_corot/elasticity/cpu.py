@@ -14,7 +14,7 @@ from warp_corot.discretization.elements import Elements
 from warp_corot.discretization.plan import Plan, Sharing
 from warp_corot.discretization.planner import places_on
 from warp_corot.elasticity.divided import Piece
-from warp_corot.elasticity.model import ROTATED, Kept
+from warp_corot.elasticity.model import ROTATED, FastForces, Kept
 from warp_corot.inputs.cpu_threads import Team, launch, part_of
 from warp_corot.inputs.loading import LoadedKernel, load
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial, RotatedMaterial
@@ -188,7 +188,7 @@ class Dilating:
 # --- any law: complete subtrees, and other elements ------------------------------------------------------------------
 
 
-class SimdForces:
+class SimdForces(FastForces):
     """The forces of a law on the CPU: of complete subtrees, and of other elements.
 
     With a shared dilatation the elements outside subtrees are in groups, and these launches add its forces, too.
@@ -240,12 +240,10 @@ class SimdForces:
         return True
 
     def derive(self) -> None:
-        """See ``ForceField``."""
         if self._dilating is not None:
             self._dilating.derive()
 
     def follow(self) -> None:
-        """See ``ForceField``."""
         plan = self.plan
         self._flat, self._lanes, elements = plan.flat, None, plan.elements
         shares = self._shares_rotations and plan.units is not None
@@ -282,7 +280,6 @@ class SimdForces:
         return scatter_subtrees(shape, self._Material, self._law)
 
     def scatter_forces(self, u: wp.array, f: wp.array) -> None:
-        """Add the forces [N] of displacements u to f; both vec4 [N]."""
         if self._flat is not self.plan.flat:
             self.follow()
         material = given = self._material()
@@ -303,7 +300,7 @@ class SimdForces:
                 flags, inputs = batch.flags_by_eights, [self.plan.elements, given, u]
                 repair, where = self._repairs[0], [1, flags, first]
                 if not own:
-                    repair, where = repair_shared, [flags, first, batch.subtrees.code, places_on("cpu").subtree]
+                    repair, where = repair_shared, [*where, batch.subtrees.code, places_on("cpu").subtree]
                 launch(repair, len(flags), [*where, *inputs], [f], device="cpu")
         if self._dilating is not None:
             self._dilating.scatter_groups(self._name, given, u, f, *self._repairs[1:])

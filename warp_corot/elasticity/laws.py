@@ -8,31 +8,24 @@ from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any, ClassVar
 
-import warp as wp
-
 from warp_corot.discretization.discretization import Discretization
 from warp_corot.discretization.plan import Plan
-from warp_corot.elasticity.clusters import divided
 from warp_corot.elasticity.cpu import SimdForces
+from warp_corot.elasticity.cuda import CudaForces, CudaLaw
 from warp_corot.elasticity.dilatation import AUTO, bind_law, check_dilatation
 from warp_corot.elasticity.model import ElementField, ForceField, Model
 from warp_corot.elasticity.tangents import DefiniteTangent, Tangent
 from warp_corot.errors import InputError
 from warp_corot.inputs.checks import checked_number, shown
-from warp_corot.inputs.loading import LoadedKernel, load
 from warp_corot.kernels.clusters.laws import isotropic_law
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial, law_functions
 from warp_corot.kernels.elements.dilatation import GREEN, LOG_VOLUME, SMALL, Dilatation
-from warp_corot.kernels.elements.forces import law_cauchy, law_differential, law_stress, law_value, scatter_chosen
+from warp_corot.kernels.elements.forces import law_cauchy, law_differential, law_stress, law_value
 from warp_corot.kernels.elements.simd8 import IsotropicLaw, stretch_limits
-from warp_corot.kernels.subtrees import cuda as subtree_cuda
-from warp_corot.kernels.subtrees.degenerate import NO_LIST
-from warp_corot.kernels.subtrees.memory import BLOCK
+from warp_corot.kernels.subtrees.cuda import scatter_law_subtrees
 
 if TYPE_CHECKING:
     from warp_corot.discretization.discretization import Discretized
-    from warp_corot.discretization.plan import Batch
-    from warp_corot.elasticity.clusters import ClusterScatter
 
 
 class LawField(ElementField):
@@ -45,7 +38,7 @@ class LawField(ElementField):
     """
 
     def __init__(self, law: IsotropicLaw, discretization: Discretization, deterministic: bool = False):
-        self._law = of = law_functions(law)
+        of = law_functions(law)
         super().__init__(
             discretization,
             stress=law_stress(of.stress),
@@ -54,12 +47,15 @@ class LawField(ElementField):
             cauchy=law_value(of.stress) if law == "linear" else law_cauchy(of.stress),
             deterministic=deterministic,
         )
-        self._uniform = discretization.material_stride == 0
         #: Linear elasticity has no principal axes of its own, and is semidefinite.
         self.has_principal_axes = law != "linear"
         if self.device.is_cpu:
-            self._simd = SimdForces(discretization, self.plan, law, lambda: self.isotropic)
-        self.follow()
+            self._fast = SimdForces(discretization, self.plan, law, lambda: self.isotropic)
+        else:
+            uniform, cluster = discretization.material_stride == 0, isotropic_law(of.stress)
+            of_subtrees = lambda shape, grouped, _: scatter_law_subtrees(shape, grouped, uniform, of.stress)  # noqa: E731
+            given = self._functions[0], lambda: self.isotropic, IsotropicMaterial, of_subtrees, cluster
+            self._fast = CudaForces(self, CudaLaw(*given))
 
     def plan_of(self, discretization: Discretization) -> Plan:
         subtrees = self.device.is_cpu or self.deterministic or discretization.prefers_subtrees
@@ -69,56 +65,6 @@ class LawField(ElementField):
         if not self.has_principal_axes:
             return self.tangent()
         return DefiniteTangent(self, self.stress_law.differential, lambda: self.material, self._Material)
-
-    @property
-    def _force_kernels(self) -> list[LoadedKernel]:
-        of_subtrees: list[LoadedKernel] = [(kernel, BLOCK) for kernel in self._kernels]
-        if self._clusters is not None:
-            return [*of_subtrees, self._clusters.kernel]
-        if self._batches and not len(self.plan.flat):
-            return of_subtrees
-        return [*of_subtrees, self._of_flat] if len(self.plan.flat) else super()._force_kernels
-
-    def load_kernels(self) -> None:
-        if self._simd is not None:
-            super().load_kernels()
-            return
-        kernels = [self._kernel(shape, grouped) for shape, grouped, _sharing in self.plan.kinds]
-        load((), self.device, [self._forces, self._of_flat, *((kernel, BLOCK) for kernel in kernels)])
-
-    def follow(self) -> None:
-        super().follow()
-        self._batches: list[Batch] = []
-        self._clusters: ClusterScatter | None = None
-        if self._simd is None:
-            self._batches, self._clusters = divided(self.discretization, self.plan, isotropic_law(self._law.stress))
-        self._kernels = [self._kernel(batch.shape, batch.grouped) for batch in self._batches]
-
-    @property
-    def _of_flat(self) -> wp.Kernel:
-        return scatter_chosen(self.discretization.element_kind, IsotropicMaterial, self._functions[0])
-
-    @property
-    def in_clusters(self) -> tuple[ClusterScatter, Sequence[Batch]] | None:
-        return None if self._clusters is None else (self._clusters, self._batches)
-
-    def _kernel(self, shape: int, grouped: bool) -> wp.Kernel:
-        return subtree_cuda.scatter_law_subtrees(shape, grouped, self._uniform, self._law.stress)
-
-    def scatter_forces(self, u: wp.array, f: wp.array) -> None:
-        if self._simd is not None:
-            self._simd.scatter_forces(u, f)
-            return
-        isotropic, flat = self.isotropic, self.plan.flat
-        for batch, kernel in zip(self._batches, self._kernels, strict=True):
-            inputs, outputs = [batch.subtrees, isotropic, u], [f, batch.flagged, NO_LIST]
-            wp.launch(kernel, batch.count, inputs, outputs, device=self.device, block_dim=BLOCK)
-        if self._clusters is not None:
-            self._clusters(isotropic, u, f)
-        elif len(flat):
-            self.launch(self._of_flat, len(flat), [self.elements, flat.leaves, isotropic, u], [f])
-        elif not self._batches:
-            super().scatter_forces(u, f)
 
 
 # --- models of one law -----------------------------------------------------------------------------------------------

@@ -33,7 +33,7 @@ from warp_corot.kernels.elements.forces import (
 
 if TYPE_CHECKING:
     from warp_corot.elasticity.clusters import ClusterScatter
-    from warp_corot.elasticity.cpu import Dilating, SimdForces
+    from warp_corot.elasticity.cpu import Dilating
     from warp_corot.kernels.stepping.pace import Pace
 
 
@@ -120,6 +120,42 @@ class SmallForces(Protocol):
         ...
 
 
+class FastForces(ABC):
+    """The launches of a law's forces, many elements at a time; see ``ForceField`` for what the methods do.
+
+    Attributes:
+        in_clusters: As of ``ForceField``.
+    """
+
+    in_clusters: tuple[ClusterScatter, Sequence[Batch]] | None = None
+
+    @property
+    @abstractmethod
+    def kernels(self) -> list[LoadedKernel]:
+        """The kernels that launches take."""
+
+    @property
+    def later_kernels(self) -> list[LoadedKernel]:
+        """Those that they may take if the mesh changes."""
+        return self.kernels
+
+    @abstractmethod
+    def scatter_forces(self, u: wp.array, f: wp.array) -> None:
+        """Launch the forces [N] of displacements u, added to f; both vec4 [N]."""
+
+    @abstractmethod
+    def follow(self) -> None: ...
+
+    def derive(self) -> None:  # noqa: B027 (most keep nothing)
+        ...
+
+    def pieces(self, team: Team) -> Sequence[Piece]:
+        return []
+
+    def share_dilatation(self, dilating: Dilating) -> bool:
+        return False
+
+
 class ForceField(ABC):
     """An elastic model on one body: launches that read displacements and add forces.
 
@@ -143,8 +179,8 @@ class ForceField(ABC):
     takes_anisotropic: ClassVar[bool] = False
     is_linear: bool = False
     shares_dilatation: ClassVar[bool] = False
-    #: The launches on the CPU of a field of an isotropic law, which threads can divide.
-    _simd: SimdForces | None = None
+    #: The launches of many elements at a time; None: element by element. Threads can divide those on the CPU.
+    _fast: FastForces | None = None
     _divided: DividedForces | None = None
 
     def __init__(self, body: Discretized | Discretization, deterministic: bool = False):
@@ -179,7 +215,7 @@ class ForceField(ABC):
 
     def pieces(self, team: Team) -> Sequence[Piece]:
         """Parts of the field whose forces add up to this one's; none if it cannot be divided."""
-        return [] if self._simd is None else self._simd.pieces(team)
+        return [] if self._fast is None else self._fast.pieces(team)
 
     def add_forces(self, u: wp.array, f: wp.array) -> None:
         """Add the elastic nodal forces [N] of displacements u to f; both vec4 [worlds * N]."""
@@ -237,8 +273,8 @@ class ForceField(ABC):
 
         Called before the first step if plans change.
         """
-        if self._simd is not None:
-            load((), self.device, self._simd.kernels)
+        if self._fast is not None:
+            load((), self.device, self._fast.later_kernels)
 
     def note(self) -> None:  # noqa: B027 (most keep nothing)
         """Launch the update of the data that elements carry; called before a pass changes the mesh."""
@@ -248,22 +284,22 @@ class ForceField(ABC):
 
         Called if plans change, each time after one is derived.
         """
-        if self._simd is not None:
-            self._simd.derive()
+        if self._fast is not None:
+            self._fast.derive()
 
     def follow(self) -> None:
         """Adapt launches to the present sizes of the plan.
 
         Called if plans change, before steps are recorded, whenever a size has changed.
         """
-        if self._simd is not None:
-            self._simd.follow()
+        if self._fast is not None:
+            self._fast.follow()
 
     def share_dilatation(self, dilating: Dilating) -> bool:
         """Add the forces of a dilatation that subtrees and groups share, too, from now on (CPU); return whether the
         field can.
         """
-        return self._simd is not None and self._simd.share_dilatation(dilating)
+        return self._fast is not None and self._fast.share_dilatation(dilating)
 
     @property
     def stiffest(self) -> SmallForces:
@@ -373,9 +409,9 @@ class ForceField(ABC):
         """The launch of elements in clusters, and the subtrees outside them; None without clusters, or if clusters
         change.
         """
-        return None
+        return None if self._fast is None else self._fast.in_clusters
 
-    def launch(self, kernel: wp.Kernel, dim: int | tuple[int, int], inputs: list, outputs: list) -> None:
+    def launch(self, kernel: wp.Kernel, dim: int | tuple[int, ...], inputs: list, outputs: list) -> None:
         launch(kernel, dim, inputs, outputs, device=self.device)
 
     def _launch_over_elements(
@@ -481,7 +517,7 @@ class ElementField(ForceField):
 
     @property
     def _force_kernels(self) -> list[LoadedKernel]:
-        return [self._forces] if self._simd is None else self._simd.kernels
+        return [self._forces] if self._fast is None else self._fast.kernels
 
     @property
     def _forces(self) -> wp.Kernel:
@@ -492,8 +528,8 @@ class ElementField(ForceField):
         return StressLaw(*self._functions, self.material, self._Material)
 
     def scatter_forces(self, u: wp.array, f: wp.array) -> None:
-        if self._simd is not None:
-            self._simd.scatter_forces(u, f)
+        if self._fast is not None:
+            self._fast.scatter_forces(u, f)
         else:
             self.launch(self._forces, self.element_count, [self.elements, self.material, u], [f])
 

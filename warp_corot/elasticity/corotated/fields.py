@@ -3,17 +3,13 @@ work."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import warp as wp
 
 from warp_corot.discretization.discretization import Discretization
 from warp_corot.discretization.plan import Batch, Plan, Sharing, Units
-from warp_corot.discretization.planner import places_on
-from warp_corot.elasticity.clusters import ChangingClusterScatter, ClusterScatter, clustered
-from warp_corot.elasticity.corotated.launches import DegenerateLeaves, OwnLaunches
 from warp_corot.elasticity.corotated.tangents import (
     FEWEST,
     ExactTangent,
@@ -23,6 +19,7 @@ from warp_corot.elasticity.corotated.tangents import (
     subtrees_of,
 )
 from warp_corot.elasticity.cpu import Dilating, SimdForces
+from warp_corot.elasticity.cuda import CudaForces, CudaLaw, OwnForces
 from warp_corot.elasticity.model import ROTATED, ForceField, Kept, StressLaw
 from warp_corot.elasticity.tangents import Tangent
 from warp_corot.inputs.loading import LoadedKernel, load
@@ -39,11 +36,11 @@ from warp_corot.kernels.corotated.corotated import (
 )
 from warp_corot.kernels.corotated.tangent import exact_differential
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial, RotatedMaterial
+from warp_corot.kernels.elements.elements import ForestElements
 from warp_corot.kernels.elements.forces import element_energies, element_von_mises, scatter_chosen, scatter_forces
 from warp_corot.kernels.math.rotation import quick_rotation
 from warp_corot.kernels.subtrees import cuda as subtree_cuda
-from warp_corot.kernels.subtrees.degenerate import NO_LIST, repair_own, repair_shared, robust_own_stress
-from warp_corot.kernels.subtrees.memory import BLOCK
+from warp_corot.kernels.subtrees.degenerate import repair_own, robust_own_stress
 
 if TYPE_CHECKING:
     from warp_corot.elasticity.corotated.model import CorotatedOptions
@@ -197,87 +194,69 @@ class CorotatedField(ForceField):
         self.launch(kernel, self.element_count, [self.elements, material, u], [output])
 
 
-# --- elements in clusters on CUDA ------------------------------------------------------------------------------------
-
-
-class CorotatedGeneralField(CorotatedField):
-    """General elements with own rotations."""
-
-    def __init__(self, discretization: Discretization, model: CorotatedOptions):
-        super().__init__(discretization, model, deterministic=False)
-        law = isotropic_law(corotated_stress)
-        self._scatter = ClusterScatter(self.elements, law, chosen=clustered(discretization))
-
-    @property
-    def _force_kernels(self) -> list[LoadedKernel]:
-        return [self._scatter.kernel]
-
-    @property
-    def in_clusters(self) -> tuple[ClusterScatter, Sequence[Batch]]:
-        return self._scatter, ()
-
-    def scatter_forces(self, u: wp.array, f: wp.array) -> None:
-        self._scatter(self.isotropic, u, f)
-
-
-# --- complete subtrees -----------------------------------------------------------------------------------------------
-#
-# The fast path of the corotated model: complete subtrees of a forest as units of work; see ``plan``.
-#
-# On CUDA with own rotations a body is at most three launches: subtrees, other leaves, and the leaves that the first
-# left out.
+# --- the fast path ---------------------------------------------------------------------------------------------------
 
 
 class SubtreeField(CorotatedField):
-    """The fast path: complete subtrees in batches, leaf by leaf only what is left over; general meshes on the CPU."""
+    """The fast path: complete subtrees in batches, and only what is left over leaf by leaf; general meshes eight
+    elements at a time or in clusters."""
 
     takes_subtrees = True
 
     def __init__(self, discretization: Discretization, model: CorotatedOptions, deterministic: bool):
         super().__init__(discretization, model, deterministic)
         self._uniform = discretization.material_stride == 0
+        self._rotations = wp.empty(0, dtype=wp.mat33, device=self.device)
+        self._no_unit = wp.empty(0, dtype=wp.int32, device=self.device)
         if self.device.is_cpu:
             law = {"repair": robust_own_stress, "tolerance": model.tolerance}
-            self._simd = SimdForces(discretization, self.plan, "corotated", lambda: self.isotropic, **law)
-        #: Adds the forces of all leaves, also of those that come later.
-        self._clusters: ChangingClusterScatter | None = None
-        if self._listed and self.rotation_level is None:
-            self._clusters = ChangingClusterScatter.of(discretization, self.plan, isotropic_law(corotated_stress))
-        self.follow()
+            self._fast = SimdForces(discretization, self.plan, "corotated", lambda: self.isotropic, **law)
+        elif self._listed and discretization.element_kind is ForestElements:
+            self._fast = OwnForces(self)
+        else:
+            self._fast = CudaForces(self, self._cuda_law())
+        self._take_units()
         self.derive()
 
-    def derive(self) -> None:
-        super().derive()
-        if self._clusters is not None:
-            self._clusters.derive()
+    def _cuda_law(self) -> CudaLaw:
+        own = IsotropicMaterial, own_stress(self.model.own_rotation)
+        Material, stress = own if self.rotation_level is None else (RotatedMaterial, given_stress)
+        cluster = isotropic_law(corotated_stress) if self._listed else None
+        repair = {"repair": repair_own, "repaired": lambda: self.isotropic}
+        return CudaLaw(stress, self._of_leaves, Material, self._kernel, cluster, self._of_batch, **repair)
+
+    def _kernel(self, shape: int, grouped: bool, sharing: Sharing) -> wp.Kernel:
+        if sharing is Sharing.OWN:
+            return subtree_cuda.scatter_subtrees_own(shape, grouped, self._uniform, False)
+        return subtree_cuda.scatter_subtrees_shared(shape, grouped, self._uniform, sharing is Sharing.ABOVE)
+
+    def _of_leaves(self) -> IsotropicMaterial | RotatedMaterial:
+        """The material of leaves one by one."""
+        if self.rotation_level is None:
+            return self.isotropic
+        return self._rotated(self.isotropic, self._rotations, self._sharing().units.unit)
+
+    def _of_batch(self, batch: Batch | None) -> IsotropicMaterial | RotatedMaterial:
+        """The material of subtrees, or of clusters."""
+        if batch is None or batch.sharing is Sharing.OWN:
+            return self.isotropic
+        kept = self._batch_materials.setdefault(batch, Kept(RotatedMaterial, *ROTATED))
+        return kept(self.isotropic, self._rotations, self._no_unit if batch.unit is None else batch.unit)
 
     @property
     def _force_kernels(self) -> list[LoadedKernel]:
-        if self._own_launches is not None:
-            return [*self._own_launches.kernels, DegenerateLeaves.kernel]
-        if self._simd is not None:
-            given = [self._extract, self._of_flat] if self.plan.units is not None else []
-            return [*self._simd.kernels, *given]
-        of_subtrees: list[LoadedKernel] = [(self._kernel(*kind), BLOCK) for kind in self.plan.kinds]
-        return [*of_subtrees, *([self._of_flat] if len(self.plan.flat) else [])]
+        assert self._fast is not None
+        return [*self._fast.kernels, *([self._extract, *self._of_units] if self.plan.units is not None else [])]
 
     @property
-    def _of_flat(self) -> wp.Kernel:
-        """The kernel of leaves outside subtrees."""
-        if self.rotation_level is None:
-            law: tuple[type, wp.Function] = IsotropicMaterial, own_stress(self.model.own_rotation)
-        else:
-            law = RotatedMaterial, given_stress
-        return scatter_chosen(self.discretization.element_kind, *law)
+    def _of_units(self) -> list[LoadedKernel]:
+        """The kernel of leaves outside subtrees on the CPU, if these use rotations from further up."""
+        given = self.discretization.element_kind, RotatedMaterial, given_stress
+        return [scatter_chosen(*given)] if self.device.is_cpu and self.rotation_level is not None else []
 
     def load_kernels(self) -> None:
-        one_launch = self._listed and self.rotation_level is None
-        kinds = () if one_launch or self._simd is not None else self.plan.kinds
-        found: list[LoadedKernel] = [(self._kernel(*kind), BLOCK) for kind in kinds]
-        found += [self._of_flat, self._extract, repair_own]
-        found += [] if self._simd is None else self._simd.kernels
-        found += [DegenerateLeaves.kernel] if self._listed else []
-        load((), self.device, [*found, *([OwnLaunches.later_kernel(self._uniform)] if one_launch else [])])
+        super().load_kernels()
+        load((), self.device, [self._extract, repair_own, *self._of_units])
 
     def share_dilatation(self, dilating: Dilating) -> bool:
         own = all(sharing is Sharing.OWN for _shape, _grouped, sharing in self.plan.kinds)
@@ -290,83 +269,32 @@ class SubtreeField(CorotatedField):
                 return SubtreeTangent(self, batches)
         return super().tangent(exact=exact)
 
-    @property
-    def in_clusters(self) -> tuple[ClusterScatter, Sequence[Batch]] | None:
-        return None if self._own_launches is None else self._own_launches.in_clusters
-
     def follow(self) -> None:
         super().follow()
-        plan = self.plan
-        self._rotations = wp.empty(0, dtype=wp.mat33, device=self.device)
-        self._no_unit = wp.empty(0, dtype=wp.int32, device=self.device)
-        if plan.units is not None:
-            self._shared = Rotations.of(plan.units)
+        self._take_units()
+
+    def _take_units(self) -> None:
+        """Make room for the rotations of the present plan's units."""
+        self._batch_materials: dict[Batch, Kept[RotatedMaterial]] = {}
+        if self.plan.units is not None:
+            self._shared = Rotations.of(self.plan.units)
             self._rotations = self._shared.rotations
         elif self.rotation_level is not None:
             self._sharing()
-        self._degenerate: DegenerateLeaves | None = None
-        self._own_launches: OwnLaunches | None = None
-        if self._listed:
-            if self.rotation_level is None:
-                given = self.isotropic, self._clusters, self.discretization.awaited
-                self._own_launches = OwnLaunches(plan, *given)
-                self._degenerate = DegenerateLeaves(self._own_launches.places, [], self.device)
-                return
-            self._degenerate = DegenerateLeaves.of(plan, self.device)
-        if self._simd is not None:
-            self._simd.rotations = self._rotations
-            return
-        self._kernels = [self._kernel(batch.shape, batch.grouped, batch.sharing) for batch in plan.batches]
-        self._batch_materials = [Kept(RotatedMaterial, *ROTATED) for _ in plan.batches]
+        if isinstance(self._fast, SimdForces):
+            self._fast.rotations = self._rotations
 
     @property
     def _listed(self) -> bool:
-        """Whether kernels list the leaves that they leave out, in any order."""
-        return self.device.is_cuda and not self.deterministic
+        """Whether each leaf has its own rotation, and sums may have any order on CUDA."""
+        return self.device.is_cuda and not self.deterministic and self.rotation_level is None
 
     def scatter_forces(self, u: wp.array, f: wp.array) -> None:
-        if self._own_launches is not None:
-            assert self._degenerate is not None
-            self._own_launches.scatter_forces(u, f, self._degenerate.own)
-            self._degenerate.repair(self.elements, self.isotropic, u, f)
-            return
+        assert self._fast is not None
         plan, flat = self.plan, self.plan.flat
         if plan.units is not None:
             self.extract_rotations(u)
-        if self._simd is not None:
-            self._simd.scatter_forces(u, f)
-        else:
-            for batch, kernel, kept in zip(plan.batches, self._kernels, self._batch_materials, strict=True):
-                self._launch_batch(batch, kernel, kept, u, f)
-        if len(flat) and (self._simd is None or plan.units is not None):
-            material: Any = self.isotropic
-            if self.rotation_level is not None:
-                material = self._rotated(material, self._rotations, self._sharing().units.unit)
-            self.launch(self._of_flat, len(flat), [self.elements, flat.leaves, material, u], [f])
-        if self._degenerate is not None:
-            self._degenerate.repair(self.elements, self.isotropic, u, f)
-
-    def _kernel(self, shape: int, grouped: bool, sharing: Sharing) -> wp.Kernel:
-        if sharing is Sharing.OWN:
-            return subtree_cuda.scatter_subtrees_own(shape, grouped, self._uniform, self._listed)
-        given = sharing is Sharing.ABOVE
-        return subtree_cuda.scatter_subtrees_shared(shape, grouped, self._uniform, given, self._listed)
-
-    def _launch_batch(
-        self, batch: Batch, kernel: wp.Kernel, kept: Kept[RotatedMaterial], u: wp.array, f: wp.array
-    ) -> None:
-        own, degenerate = batch.sharing is Sharing.OWN, self._degenerate
-        unit = self._no_unit if batch.unit is None else batch.unit
-        material = self.isotropic if own else kept(self.isotropic, self._rotations, unit)
-        outputs = [f, batch.flagged, NO_LIST if degenerate is None else degenerate.list_of(batch)]
-        inputs = [batch.subtrees, material, u]
-        wp.launch(kernel, batch.count, inputs, outputs, device=self.device, block_dim=BLOCK)
-        if degenerate is not None or not batch.count:
-            return
-        flags = batch.flags_by_eights
-        inputs = [self.elements, self.isotropic, u]
-        if own:
-            self.launch(repair_own, len(flags), [1, flags, batch.subtrees.first, *inputs], [f])
-        elif batch.sharing is Sharing.ROOT:
-            where = [flags, batch.subtrees.first, batch.subtrees.code, places_on(self.device.alias).subtree]
-            self.launch(repair_shared, len(flags), [*where, *inputs], [f])
+        self._fast.scatter_forces(u, f)
+        if len(flat) and plan.units is not None:
+            for kernel in self._of_units:
+                self.launch(kernel, len(flat), [self.elements, flat.leaves, self._of_leaves(), u], [f])

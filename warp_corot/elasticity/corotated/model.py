@@ -8,10 +8,9 @@ from typing import TYPE_CHECKING
 
 import warp as wp
 
-from warp_corot.elasticity.anisotropic import AnisotropicCudaField, AnisotropicField
+from warp_corot.elasticity.anisotropic import AnisotropicField
 from warp_corot.elasticity.corotated.fields import (
     CorotatedField,
-    CorotatedGeneralField,
     SubtreeField,
 )
 from warp_corot.elasticity.dilatation import AUTO, bind_law, check_dilatation
@@ -136,10 +135,8 @@ class Corotated(CorotatedOptions):
                 return SubtreeField(discretization, self, deterministic)
         elif self.level is not None:
             raise InputError(f"rotation_level {self.rotation_level} needs a forest; a general mesh has no tree")
-        elif fast and discretization.device.is_cpu:
+        elif fast and (discretization.device.is_cpu or not deterministic):
             return SubtreeField(discretization, self, deterministic)
-        elif fast and not deterministic:
-            return CorotatedGeneralField(discretization, self)
         return CorotatedField(discretization, self, deterministic)
 
     def _bind_anisotropic(self, discretization: Discretization, deterministic: bool) -> AnisotropicField:
@@ -148,6 +145,4 @@ class Corotated(CorotatedOptions):
             raise InputError(f"the material is {name}; only the model HolzapfelGasserOgden supports this material")
         if self.rotation_level is not None:
             raise InputError(f"rotation_level is {self.rotation_level!r}; with an anisotropic material it must be None")
-        if self.own_rotation is quick_rotation and discretization.device.is_cuda and not deterministic:
-            return AnisotropicCudaField(discretization)
         return AnisotropicField(discretization, self.own_rotation, deterministic)

@@ -18,7 +18,7 @@ import numpy as np
 import warp as wp
 
 from warp_corot.body.keyframes import Followed
-from warp_corot.elasticity.corotated.fields import CorotatedGeneralField, SubtreeField
+from warp_corot.elasticity.corotated.fields import SubtreeField
 from warp_corot.elasticity.dilatation import law_of
 from warp_corot.kernels.math.rotation import quick_rotation
 from warp_corot.kernels.stepping.patches import Exchange, Layout, PatchBody, step_patches
@@ -27,7 +27,6 @@ from warp_corot.materials.anisotropic import Directional
 if TYPE_CHECKING:
     from warp_corot.body.soft_body import SoftBody
     from warp_corot.elasticity import ForceField
-    from warp_corot.elasticity.corotated.fields import CorotatedField
     from warp_corot.solvers.system import System
 
 
@@ -436,11 +435,11 @@ def _suits(body: SoftBody, field: ForceField) -> bool:
 
 def _has_own_rotations(field: ForceField) -> bool:
     """Whether the model is the corotated one on a fast path, with a rotation of each element."""
-    if not isinstance(field, (SubtreeField, CorotatedGeneralField)):
-        return False
-    of_model: CorotatedField = field
-    model = of_model.model
-    return model.rotation_level is None and model.own_rotation is quick_rotation
+    return (
+        isinstance(field, SubtreeField)
+        and field.model.rotation_level is None
+        and field.model.own_rotation is quick_rotation
+    )
 
 
 def _device_patches(body: SoftBody, patches: Patches, layout: Layout) -> PatchBody:

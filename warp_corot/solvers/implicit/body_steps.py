@@ -1,8 +1,8 @@
-"""Steps of one body, and what the steps of all bodies of a system share."""
+"""Steps of one body."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import warp as wp
@@ -17,84 +17,22 @@ from warp_corot.solvers.halo import ALONE
 from .block_system import BlockSystem
 from .multigrid import Multigrid
 from .newton import Newton
-from .operator import Contact, Hold, Touching
 from .preconditioners import Lagged, preconditioner_of
 from .tangent import TangentOperator, TurnedState
 
 if TYPE_CHECKING:
-    from warp_corot.solvers.system import System
+    from .stepper import ImplicitStepper
 
-    from .schemes import ImplicitIntegrator
-
-
-#: The search for soft surfaces leaves room for this many times what a body that is let go falls in a step.
-FALLS = 0.25
 
 #: The tolerance of steps of one iteration that have to be repeated, since the whole step raises the energy.
 REPEATED = 1e-3
-
-
-class SharedSteps:
-    """What the steps of all bodies share: the system, its constraints, and the launches of forces.
-
-    Args:
-        system: The bodies.
-        integrator: The integrator.
-
-    Attributes:
-        totals: Steps, iterations of Newton's method and of linear solves, and steps that did not come within the
-            tolerance, of all bodies, int64 [4].
-        touching: The constraints that implicit steps resolve.
-        contact: The contact of all bodies, or None.
-        couples: Whether all bodies are solved for together, because they may touch one another.
-        begins: Nonzero if all bodies that are solved for together begin again with a first step, int32 [1].
-        sturdy: Nonzero while each step is a first step, of backward Euler, int32 [1].
-    """
-
-    def __init__(self, system: System, integrator: ImplicitIntegrator):
-        self.system, self.integrator = system, integrator
-        self.totals = wp.zeros(4, dtype=wp.int64, device=system.device)
-        self.touching = cast("list[Touching]", [each for each in system.constraints if hasattr(each, "implicit")])
-        found = (each.implicit() for each in self.touching)
-        self.contact: Contact | None = next((each for each in found if each is not None), None)
-        self.couples = self.contact is not None and self.contact.couples
-        if self.contact is not None:
-            self.contact.reserve(FALLS * float(np.linalg.norm(system.gravity)) * integrator.dt**2)
-        self.begins, self.sturdy = (wp.zeros(1, dtype=wp.int32, device=system.device) for _ in range(2))
-
-    @property
-    def turns(self) -> bool:
-        """Whether steps are linearised where bodies will be turned."""
-        return self.integrator.tolerance is None and self.integrator.turns
-
-    def add_other_forces(self) -> None:
-        """Launch all forces except elastic ones in the present state to ``state.forces`` of the bodies."""
-        self.forget_forces()
-        for forces in [*self.system.forces, *self.holds]:
-            forces.add_forces()
-
-    @property
-    def holds(self) -> list[Hold]:
-        """The constraints that are springs in implicit steps."""
-        return cast("list[Hold]", [each for each in self.system.constraints if hasattr(each, "add_stiffness")])
-
-    def add_counted_forces(self) -> None:
-        """The same for forces whose work is counted separately."""
-        self.forget_forces()
-        for forces in self.system.counted:
-            forces.add_forces()
-
-    def forget_forces(self) -> None:
-        """Launch the reset of all forces."""
-        for body in self.system.bodies:
-            body.state.forces.zero_()
 
 
 class BodySteps:
     """Steps of one body.
 
     Args:
-        shared: What the steps of all bodies share.
+        stepper: The steps of all bodies.
         k: The number of the body in the system.
 
     Attributes:
@@ -107,13 +45,13 @@ class BodySteps:
         newton: Newton's method, or the residual of a linearisation.
     """
 
-    def __init__(self, shared: SharedSteps, k: int):
-        self.shared, self.k = shared, k
-        system, options = shared.system, shared.integrator
+    def __init__(self, stepper: ImplicitStepper, k: int):
+        self.stepper, self.k = stepper, k
+        system, options = stepper.system, stepper.integrator
         self.body, self.field, self.system = system.bodies[k], system.fields[k], system
         self.device = self.body.device
         self.viscosity = Viscosity(self.body, self.field, options.viscosity) if options.viscosity else None
-        touches = shared.contact is not None
+        touches = stepper.contact is not None
         # Contact needs a matrix that is positive definite.
         exact = options.tolerance is not None and not touches
         self.operator = TangentOperator(
@@ -139,7 +77,7 @@ class BodySteps:
             # Halfway through a turn, where the motion of the step has no strain.
             self.operator.frame = wp.zeros_like(like)
         self._moves = wp.zeros(1, dtype=wp.int32, device=self.device)
-        self.begins = shared.begins if shared.couples else wp.zeros(1, dtype=wp.int32, device=self.device)
+        self.begins = stepper.begins if stepper.couples else wp.zeros(1, dtype=wp.int32, device=self.device)
         tables = np.stack([options.scheme(options.dt), options.start(options.dt)])
         if touches:
             # The increments of a step with contact begin with zero.
@@ -150,7 +88,7 @@ class BodySteps:
 
     def take_system(self, system: BlockSystem, number: int) -> None:
         """Take the linear system in which the body has this number, made for its present mesh."""
-        options = self.shared.integrator
+        options = self.stepper.integrator
         self.newton = Newton(
             system,
             self.system.gravity,
@@ -160,7 +98,8 @@ class BodySteps:
             others=self._add_others,
         )
         self.newton.is_at_stage = options.is_at_stage
-        if self.shared.turns:
+        if options.turns and options.tolerance is None:
+            # Steps are linearised where bodies will be turned.
             self.newton.turned = TurnedState(self.operator, options.dt)
 
     def forget(self) -> None:
@@ -174,14 +113,14 @@ class BodySteps:
             self.preconditioner.prepare()
         elif isinstance(self.preconditioner, Multigrid):
             self.preconditioner.follow()
-        contact, alone = self.shared.contact, self.system.ranks.is_alone
+        contact, alone = self.stepper.contact, self.system.ranks.is_alone
         if contact is not None and alone and hasattr(self.preconditioner, "follow_springs"):
             self.preconditioner.follow_springs(contact.springs(self.k))
-        if self.shared.holds and self.shared.integrator.is_at_stage:
+        if self.stepper.holds and self.stepper.integrator.is_at_stage:
             raise InputError("GeneralizedAlpha supports grasps only with spectral_radius=0")
         self.operator.stiff_forces = (
             *(each for each in self.system.forces if hasattr(each, "add_stiffness")),
-            *self.shared.holds,
+            *self.stepper.holds,
         )
         u = self.body.state.displacements
         self.field.elastic_forces(u)
@@ -193,8 +132,8 @@ class BodySteps:
         self.body.conditions.follow_activations(self.system.pace, offset + 1)
         body, system = self.body, self.system
         body.conditions.follow_trajectories(system.pace, offset, system.support_work_of(body))
-        if not self.shared.couples:
-            wp.copy(self.begins, self.shared.sturdy)
+        if not self.stepper.couples:
+            wp.copy(self.begins, self.stepper.sturdy)
         if not self.history:
             return
         state = self.body.state
@@ -215,7 +154,7 @@ class BodySteps:
             self._find_reactions()
         else:
             wp.capture_if(self._moves, self._find_reactions)
-        wp.launch(kernels.count_solves, 1, counts, [self.shared.totals], device=self.device)
+        wp.launch(kernels.count_solves, 1, counts, [self.stepper.totals], device=self.device)
 
     # --- pieces ------------------------------------------------------------------------------------------------------
 
@@ -226,7 +165,7 @@ class BodySteps:
             self.body.state,
             self.body.conditions,
             self.newton,
-            self.shared.integrator,
+            self.stepper.integrator,
         )
         inputs = [self.begins, self._table, options.damping]
         outputs = [self.operator.scales, newton.inertia, newton.share]
@@ -243,7 +182,7 @@ class BodySteps:
 
     def _add_others(self) -> None:
         """Launch forces other than elastic ones at the stage."""
-        self.shared.add_other_forces()
+        self.stepper.add_other_forces()
         if self.viscosity is not None:
             inputs = [self.operator.scales, self.newton.increment, self._drift]
             self._launch(kernels.find_rates, inputs, [self._rates])
@@ -259,7 +198,7 @@ class BodySteps:
         body, system, newton = self.body, self.system, self.newton
         state, conditions = body.state, body.conditions
         inputs = [self.begins, self._table, self.operator.node_count, status, conditions.inverse_mass]
-        rests = self.shared.integrator.settles_contact and self.shared.contact is not None
+        rests = self.stepper.integrator.settles_contact and self.stepper.contact is not None
         inputs += [newton.base, newton.increment, state.contact_forces if rests else self._none]
         inputs += [system.pace.arrays, offset]
         outputs = [state.velocities, *self._h, state.displacements, *self._left, system.bad_step, self._moves]
@@ -268,12 +207,12 @@ class BodySteps:
         system.ranks.exchange(self.k, state.displacements)
         self.field.complete_step(state.displacements, system.pace.arrays)
         if system.counted:
-            self.shared.add_counted_forces()
+            self.stepper.add_counted_forces()
             account = system.accounts[self.k]
             self._launch(kernels.count_work, [conditions.inverse_mass, state.forces, newton.increment], [account])
-        if self.shared.holds:
-            self.shared.add_other_forces()
-            for hold in self.shared.holds:
+        if self.stepper.holds:
+            self.stepper.add_other_forces()
+            for hold in self.stepper.holds:
                 hold.launch_held(body)
         for account in system.constraint_accounts(self.k):
             inputs = [conditions.inverse_mass, state.contact_forces, newton.increment]
@@ -292,11 +231,11 @@ class BodySteps:
         body, system, newton = self.body, self.system, self.newton
         state, conditions = body.state, body.conditions
         self.field.add_forces(state.displacements, newton.forces)
-        self.shared.add_other_forces()
+        self.stepper.add_other_forces()
         inputs = [system.dynamics(body, 0.0), conditions.mass, newton.forces, newton.increment]
         self._launch(kernels.count_supports, inputs, [state.reactions, system.support_work_of(body)])
         newton.forces.zero_()
-        self.shared.forget_forces()
+        self.stepper.forget_forces()
 
     def _launch(self, kernel: wp.Kernel, inputs: list, outputs: list) -> None:
         wp.launch(kernel, self.body.sizes.launch_nodes, inputs, outputs, device=self.device)

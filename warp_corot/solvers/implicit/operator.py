@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from warp_corot.body.soft_body import SoftBody
     from warp_corot.kernels.implicit.assembled import Couplings
 
-    from .tension import Tension
+    from .tangent import TangentOperator
 
 
 class Product(Protocol):
@@ -43,52 +43,13 @@ class Product(Protocol):
         ...
 
 
-class LinearOperator(Product, Protocol):
-    """A symmetric matrix A = a M + b D + c K at one state of a body: mass, damping and stiffness.
-
-    Rows of nodes that are not free are those of the identity, and their diagonal blocks too.
-
-    Attributes:
-        inverse_mass: Zero at nodes that are not free, float32 [worlds * nodes] [1/kg].
-        displacements: The displacements of the linearisation, vec4 [worlds * nodes] [m]; they change with each one.
-        scales: a [1/s^2], b [1/s] and c, float32 [3] on the device, so that recorded launches stay valid.
-        tension: The stiffness of tension, a part of K, or None.
-        revision: Changes whenever launches do, so that they must be recorded again: other arrays, other elements. A
-            new linearisation or new scales do not change it.
-    """
-
-    @property
-    def inverse_mass(self) -> wp.array: ...
-
-    @property
-    def displacements(self) -> wp.array: ...
-
-    @property
-    def scales(self) -> wp.array: ...
-
-    @property
-    def tension(self) -> Tension | None: ...
-
-    @property
-    def revision(self) -> int: ...
-
-    def diagonal_blocks(self) -> wp.array:
-        """Launch the 3x3 blocks on the diagonal of A, and return their array, mat33 [worlds * nodes]."""
-        ...
-
-    def other_blocks(self) -> wp.array:
-        """Launch the 3x3 blocks on K's diagonal of forces besides elasticity, and give their array, mat33
-        [worlds * nodes], which ``diagonal_blocks`` may use, too; an array of one entry if there are none."""
-        ...
-
-
 class Preconditioner(Protocol):
     """An approximate inverse B of an operator: linear, symmetric and positive definite.
 
     At nodes that are not free, B keeps the zeros of r.
     """
 
-    def update(self, operator: LinearOperator) -> None:
+    def update(self, operator: TangentOperator) -> None:
         """Launch the update after a new linearisation or new scales of the operator."""
         ...
 

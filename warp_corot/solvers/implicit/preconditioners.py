@@ -16,7 +16,7 @@ from warp_corot.solvers.halo import ALONE, Halo
 
 from .assembled import AssembledSolve
 from .multigrid import Multigrid
-from .operator import LinearOperator, Preconditioner, Springs
+from .operator import Preconditioner, Springs
 from .tangent import TangentOperator
 
 if TYPE_CHECKING:
@@ -30,12 +30,12 @@ class BlockDiagonal:
         operator: The operator, for its sizes.
     """
 
-    def __init__(self, operator: LinearOperator):
+    def __init__(self, operator: TangentOperator):
         self._operator, self.device = operator, operator.device
         # The arrays of a mesh that changes keep their length.
         self._inverses = wp.zeros(len(operator.inverse_mass), dtype=wp.mat33, device=self.device)
 
-    def update(self, operator: LinearOperator) -> None:
+    def update(self, operator: TangentOperator) -> None:
         self._launch(invert_blocks, [operator.diagonal_blocks()], [self._inverses])
 
     def apply(self, r: wp.array, z: wp.array) -> None:
@@ -49,7 +49,7 @@ class BlockDiagonal:
 class Seen:
     """An operator with some of its members replaced."""
 
-    def __init__(self, operator: LinearOperator, **members: wp.array | None):
+    def __init__(self, operator: TangentOperator, **members: wp.array | None):
         self._operator = operator
         vars(self).update(members)
 
@@ -69,7 +69,7 @@ class Lagged:
         state: Arrays by name to be kept with the state of the body, so that a resumed run is the same.
     """
 
-    def __init__(self, preconditioner: Multigrid, operator: LinearOperator, ranks: Halo = ALONE):
+    def __init__(self, preconditioner: Multigrid, operator: TangentOperator, ranks: Halo = ALONE):
         self._ranks = ranks
         self.preconditioner, self._operator, self.device = preconditioner, operator, operator.device
         self._counts = wp.zeros(kernels.COUNTS, dtype=wp.int32, device=self.device)
@@ -95,7 +95,7 @@ class Lagged:
             self._due.fill_(int(kernels.AGAIN))
         self._is_prepared = True
 
-    def update(self, operator: LinearOperator) -> None:
+    def update(self, operator: TangentOperator) -> None:
         """Launch a set-up if one is due."""
         wp.launch(
             kernels.find_held_changes,

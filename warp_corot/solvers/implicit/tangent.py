@@ -21,7 +21,9 @@ if TYPE_CHECKING:
 
 
 class TangentOperator:
-    """A = a M + b D + c K of a body, a ``LinearOperator``.
+    """A symmetric matrix A = a M + b D + c K at one state of a body: mass, damping and stiffness.
+
+    Rows of nodes that are not free are those of the identity, and their diagonal blocks too.
 
     Args:
         body: The body.
@@ -37,6 +39,7 @@ class TangentOperator:
     Attributes:
         tangent: The elastic K, without tension's part if there is a ``tension``.
         tension: The rest of the elastic K, or None.
+        scales: a [1/s^2], b [1/s] and c, float32 [3] on the device, so that recorded launches stay valid.
         frame: Displacements whose rotations turn viscous forces [m], vec4; None: those of the linearisation.
     """
 
@@ -80,14 +83,17 @@ class TangentOperator:
 
     @property
     def inverse_mass(self) -> wp.array:
+        """Zero at nodes that are not free, float32 [worlds * nodes] [1/kg]."""
         return self.body.conditions.inverse_mass
 
     @property
     def displacements(self) -> wp.array:
+        """Those of the linearisation, vec4 [worlds * nodes] [m]; they change with each one."""
         return self.tangent.displacements
 
     @property
     def revision(self) -> int:
+        """Changes whenever launches do, so that they must be recorded again: other arrays, other elements."""
         return self.body.launch_revision
 
     def set_scales(self, mass: float, damping: float, stiffness: float) -> None:
@@ -121,6 +127,7 @@ class TangentOperator:
         self._launch(finish_rows, inputs, [y])
 
     def diagonal_blocks(self) -> wp.array:
+        """Launch the 3x3 blocks on the diagonal of A, and return their array, mat33 [worlds * nodes]."""
         blocks, conditions = self._blocks, self.body.conditions
         blocks.zero_()
         self.tangent.add_diagonal(blocks)
@@ -133,6 +140,8 @@ class TangentOperator:
         return blocks
 
     def other_blocks(self) -> wp.array:
+        """Launch those of K of forces besides elasticity, and give their array, which may be that of
+        ``diagonal_blocks``; an array of one entry if there are none."""
         if not self.stiff_forces:
             return self._no_blocks
         self._blocks.zero_()

@@ -17,7 +17,7 @@ from warp_corot.kernels.elements.mean_dilatation_rows import NO_LIMIT, GroupRows
 from warp_corot.kernels.implicit.multigrid import cycle, dense, values
 from warp_corot.kernels.implicit.multigrid import pattern as kernels
 from warp_corot.kernels.tables.shapes import GRADIENT
-from warp_corot.solvers.implicit.operator import LinearOperator
+from warp_corot.solvers.implicit.tangent import TangentOperator
 
 from .pattern import Midpoints, Pattern, PatternFinder
 
@@ -329,7 +329,7 @@ class LeafMatrix:
 
     def gather(
         self,
-        operator: LinearOperator,
+        operator: TangentOperator,
         blocks: wp.array,
         inverses: wp.array,
         *,
@@ -376,7 +376,7 @@ class LeafMatrix:
         self._launch(values.finish_leaves, count, inputs, [blocks, inverses], *key)
 
     def _leaves(
-        self, operator: LinearOperator, blocks: wp.array, stiffening: float, most_lambda: float
+        self, operator: TangentOperator, blocks: wp.array, stiffening: float, most_lambda: float
     ) -> values.Leaves:
         body, found, leaves = self._discretization, self.pattern, values.Leaves()
         leaves.elements, leaves.world_elements = self._elements, body.sizes.world_elements

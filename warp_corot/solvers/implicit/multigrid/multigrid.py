@@ -16,7 +16,8 @@ from warp_corot.discretization.plan import Batch
 from warp_corot.errors import InputError
 from warp_corot.kernels.implicit.multigrid import pattern, values
 from warp_corot.kernels.implicit.multigrid import springs as kernels
-from warp_corot.solvers.implicit.operator import LinearOperator, Springs
+from warp_corot.solvers.implicit.operator import Springs
+from warp_corot.solvers.implicit.tangent import TangentOperator
 
 from .level import DenseInverse, LeafMatrix, Level, SmoothedLevel, SweptLevel
 from .pattern import Midpoints, Pattern, PatternFinder
@@ -167,12 +168,12 @@ class Multigrid:
         self.revision += 1
         return True
 
-    def update(self, operator: LinearOperator) -> None:
+    def update(self, operator: TangentOperator) -> None:
         """Launch the computation of all matrices at the operator's displacements and scales."""
         self.update_finest(operator)
         self._update_coarser()
 
-    def update_finest(self, operator: LinearOperator) -> None:
+    def update_finest(self, operator: TangentOperator) -> None:
         """Launch the computation of the finest level's matrix."""
         finest, inverse_mass = self.levels[0], operator.inverse_mass
         free_inputs = [self.count, self._mesh_nodes, self._nodes, inverse_mass]

@@ -23,7 +23,7 @@ from warp_corot.kernels.implicit.multigrid import subtrees
 from warp_corot.kernels.implicit.multigrid.values import rest_frame, turned_frame
 from warp_corot.kernels.subtrees.memory import BLOCK
 from warp_corot.mesh import TetForest
-from warp_corot.solvers.implicit.operator import LinearOperator
+from warp_corot.solvers.implicit.tangent import TangentOperator
 
 from .level import Level, SmoothedLevel
 from .pattern import Midpoints, Pattern, PatternFinder
@@ -88,7 +88,7 @@ class SubtreeLevel(SmoothedLevel):
         self._own.level, self._own.stiffening, self._own.products = self.arrays, cycle.stiffening, wp.zeros_like(self.r)
         self._own.masses = wp.zeros(len(self.r), dtype=wp.float32, device=device)
 
-    def update(self, operator: LinearOperator, mesh_nodes: int, nodes: wp.array) -> None:
+    def update(self, operator: TangentOperator, mesh_nodes: int, nodes: wp.array) -> None:
         """Launch rotations, rows, the diagonal and the matrices of roots at the operator's displacements.
 
         Args:
