@@ -113,7 +113,7 @@ class Steps:
                     if self.device.is_cpu and not self.device.is_capturing:
                         left = following.count_for(dt - done)
                         each = (dt - done) / left
-                self._launch_gathered(step, now, each, before, following, done)
+                self._launch_substep(step, now, each, before, following, done, gathered=True)
             number, left, done = number + 1, left - 1, done + each
             now = step.state_out
         if self.others.has_bodies:
@@ -126,16 +126,19 @@ class Steps:
         self.report.launch()
 
     def _launch_substep(
-        self, step: Step, now: newton.State, each: float, before: list, following: Following | None
+        self,
+        step: Step,
+        now: newton.State,
+        each: float,
+        before: list,
+        following: Following | None,
+        done: float = 0.0,
+        *,
+        gathered: bool = False,
     ) -> None:
-        """Launch a substep that is not the first one."""
-        self._launch_gathering(now, step.state_in, 1, False)
-        self._launch_gathered(step, now, each, before, following, 0.0)
-
-    def _launch_gathered(
-        self, step: Step, now: newton.State, each: float, before: list, following: Following | None, done: float
-    ) -> None:
-        """Launch a substep from gathered positions, after some time of the step [s]."""
+        """Launch a substep after some time of the step [s], from positions that have been gathered or are to be."""
+        if not gathered:
+            self._launch_gathering(now, step.state_in, 1, False)
         substep = step._replace(state_in=now, dt=each)
         self._launch_forces(substep, step.state_in, each / step.dt, done)
         self._launch_motion(substep, RUNAWAY if following is None else min(RUNAWAY, following.reach / each))
