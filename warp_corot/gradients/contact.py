@@ -33,6 +33,8 @@ MOST_ROWS = 4000
 DEPENDENT = 1e-7
 #: The step of differences of obstacles' normals, over the size of the body, and that of pairs' over theirs.
 STEP, STEP_OF_PAIRS = 1e-3, 1e-5
+#: An imaginary step so small that its square is nothing [m].
+IMAGINARY = 1e-30
 #: Curvature times the size of the body, below which an obstacle is flat.
 FLAT = 1e-2
 #: The share of Coulomb's bound from which on a contact slips.
@@ -350,31 +352,22 @@ def by_nodes(matrix: Array) -> Array:
 
 def pair_hessian(row: ActingRow, x: Array) -> Array:
     """The second derivative of a pair's gap with respect to its four places x [1/m], [12, 12], by central differences
-    of the first."""
+    of the first, which is that of an imaginary step."""
     step = STEP_OF_PAIRS * float(np.abs(x - x[0]).max())
-    slopes = np.zeros((12, 12))
-    for k in range(12):
-        by = np.zeros(12)
-        by[k] = step
-        ahead, behind = (_pair_slope(row, x + sign * by.reshape(4, 3)) for sign in (1.0, -1.0))
-        slopes[k] = (ahead - behind) / (2.0 * step)
-    return np.asarray(0.5 * (slopes + slopes.T))
+    steps = step * np.array([1.0, -1.0])[:, None, None, None] * np.eye(12)[:, None]
+    places = (x.ravel() + steps + 1j * IMAGINARY * np.eye(12)).reshape(2, 12, 12, 4, 3)
+    ahead, behind = _pair_gap(row, places).imag / IMAGINARY
+    found = (ahead - behind) / (2.0 * step)
+    return np.asarray(0.5 * (found + found.T))
 
 
-def _pair_slope(row: ActingRow, x: Array) -> Array:
-    """The derivative of a pair's gap with respect to its four places, [12]."""
-    if row.first == 2:
-        along, across = x[1] - x[0], x[3] - x[2]
-        normal = np.cross(along, across)
-        s, t, _ = np.linalg.solve(np.stack([along, -across, normal], axis=1), x[2] - x[0])
-        shares = np.array([1.0 - s, s, t - 1.0, -t])
-    else:
-        first, second = x[2] - x[1], x[3] - x[1]
-        normal = np.cross(first, second)
-        s, t, _ = np.linalg.solve(np.stack([first, second, normal], axis=1), x[0] - x[1])
-        shares = np.array([1.0, s + t - 1.0, -s, -t])
-    normal = normal * np.sign(normal @ row.normal) / np.linalg.norm(normal)
-    return np.asarray((shares[:, None] * normal).ravel())
+def _pair_gap(row: ActingRow, x: npt.NDArray[np.complexfloating]) -> npt.NDArray[np.complexfloating]:
+    """The gap of a pair at places x [..., 4, 3]: of two lines, or of a point and a plane."""
+    corner = 2 if row.first == 2 else 1
+    first = x[..., 1, :] - x[..., 0, :] if row.first == 2 else x[..., 2, :] - x[..., 1, :]
+    normal = np.cross(first, x[..., 3, :] - x[..., corner, :])
+    sign = np.sign(normal.real @ row.normal)
+    return sign * np.sum(normal * (x[..., 0, :] - x[..., corner, :]), axis=-1) / np.sqrt(np.sum(normal**2, axis=-1))
 
 
 def unit_normal(row: ActingRow) -> Array:

@@ -38,34 +38,25 @@ def value_and_derivative(objective: Objective, positions: wp.array) -> tuple[flo
     with wp.Tape() as tape:
         found = objective(positions)
     if isinstance(found, wp.array):
-        value, derivative = _by_tape(found, tape, positions)
-    else:
-        value, derivative = _given(found, len(positions))
-    if not (np.isfinite(value) and np.isfinite(derivative).all()):
-        raise InputError("objective gives a value or a gradient that is not finite")
-    return value, derivative
-
-
-def _by_tape(loss: wp.array, tape: wp.Tape, positions: wp.array) -> tuple[float, npt.NDArray[np.float64]]:
-    if loss.size != 1 or not loss.requires_grad:
-        raise InputError(
-            f"objective gives an array of {loss.size} numbers with requires_grad={loss.requires_grad}; it must be one "
-            "number, for instance in wp.zeros(1, dtype=float, requires_grad=True)"
-        )
-    tape.backward(loss)
-    return float(loss.numpy().ravel()[0]), positions.grad.numpy().astype(np.float64)
-
-
-def _given(found: Any, count: int) -> tuple[float, npt.NDArray[np.float64]]:
+        if found.size != 1 or not found.requires_grad:
+            raise InputError(
+                f"objective gives an array of {found.size} numbers with requires_grad={found.requires_grad}; it must "
+                "be one number, for instance in wp.zeros(1, dtype=float, requires_grad=True)"
+            )
+        tape.backward(found)
+        found = found.numpy().ravel()[0], positions.grad
     try:
         value, gradient = found
         value = float(value)
         derivative = np.asarray(gradient.numpy() if isinstance(gradient, wp.array) else gradient, np.float64)
     except (TypeError, ValueError):
         raise InputError(f"objective gives {shown(found)}; it must give {WANTED}") from None
-    if derivative.size != 3 * count:
-        raise InputError(f"the gradient that objective gives has shape {derivative.shape}; it must be [{count}, 3]")
-    return value, derivative.reshape(count, 3)
+    if derivative.size != 3 * len(positions):
+        wanted = f"it must be [{len(positions)}, 3]"
+        raise InputError(f"the gradient that objective gives has shape {derivative.shape}; {wanted}")
+    if not (np.isfinite(value) and np.isfinite(derivative).all()):
+        raise InputError("objective gives a value or a gradient that is not finite")
+    return value, derivative.reshape(-1, 3)
 
 
 #: Names of the input that may be replaced; "gravity" does not belong to a body.

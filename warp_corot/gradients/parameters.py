@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Sequence
+from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -222,15 +223,24 @@ def checked_names(wrt: str | Sequence[str], known: Collection[str]) -> tuple[str
     return names
 
 
-def requested(found: object, name: str, known: Collection[str]) -> Any:
-    """A derivative by its name.
+@dataclass(frozen=True, kw_only=True)
+class Derivatives:
+    """Derivatives of an objective, float64; those that were not requested are None."""
 
-    Raises:
-        InputError: It was not requested.
-    """
-    if name not in known or getattr(found, name) is None:
-        raise InputError(f"{shown(name)} is not one of the requested derivatives")
-    return getattr(found, name)
+    young: Array | float | None = None
+    poisson: Array | float | None = None
+    density: Array | float | None = None
+    loads: Array | None = None
+    gravity: Array | None = None
+    rest: Array | None = None
+    activation: Array | None = None
+    obstacles: Array | None = None
+
+    def __getitem__(self, name: str) -> Any:
+        known = {field.name for field in fields(self) if field.default is None}
+        if name not in known or getattr(self, name) is None:
+            raise InputError(f"{shown(name)} is not one of the requested derivatives")
+        return getattr(self, name)
 
 
 def of_modulus(body: SoftBody, name: str, of_mu: Array, of_lam: Array) -> Array | float:

@@ -6,7 +6,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -35,7 +34,7 @@ from . import parameters
 from .adjoint import Adjoint
 from .contact import RestingContact, rows_after
 from .objective import Objective, value_and_derivative
-from .parameters import StepSums
+from .parameters import Derivatives, StepSums
 from .static import bound, friction_of
 
 Array = npt.NDArray[np.float64]
@@ -231,8 +230,8 @@ NAMES = (
 )
 
 
-@dataclass(frozen=True)
-class RunGradient:
+@dataclass(frozen=True, kw_only=True)
+class RunGradient(Derivatives):
     """The result of ``run_gradient``. Derivatives are float64; those that were not requested are None.
 
     ``gradient["young"]`` is ``gradient.young``.
@@ -250,19 +249,8 @@ class RunGradient:
 
     value: float
     kept: int
-    young: Array | float | None = None
-    poisson: Array | float | None = None
-    density: Array | float | None = None
-    loads: Array | None = None
-    gravity: Array | None = None
-    rest: Array | None = None
-    activation: Array | None = None
     displacements: Array | None = None
     velocities: Array | None = None
-    obstacles: Array | None = None
-
-    def __getitem__(self, name: str) -> Any:
-        return parameters.requested(self, name, NAMES)
 
 
 @under_lock
@@ -329,7 +317,7 @@ def run_gradient(
     found = sums.derivatives() | {"displacements": of_u, "velocities": of_v, "obstacles": of_obstacles}
     if "rest" in names:
         found["rest"] = found["rest"] + of_u
-    return RunGradient(seen.value, run.kept, **{name: found[name] for name in names})
+    return RunGradient(value=seen.value, kept=run.kept, **{name: found[name] for name in names})
 
 
 def check_finite(body: SoftBody) -> None:

@@ -27,7 +27,7 @@ from . import parameters
 from .adjoint import Adjoint
 from .contact import PreciseContact, RestingContact
 from .objective import Objective, value_and_derivative
-from .parameters import ElementWork, derivatives
+from .parameters import Derivatives, ElementWork, derivatives
 
 Array = npt.NDArray[np.float64]
 
@@ -203,8 +203,8 @@ def solved_state(body: SoftBody, *, precision: str = FLOAT32, model: Model | Non
     return PreciseState(solved)
 
 
-@dataclass(frozen=True)
-class StaticGradient:
+@dataclass(frozen=True, kw_only=True)
+class StaticGradient(Derivatives):
     """The result of ``static_gradient``. Derivatives are float64; those that were not requested are None.
 
     ``gradient["young"]`` is ``gradient.young``.
@@ -229,18 +229,7 @@ class StaticGradient:
     report: StaticReport = field(repr=False)
     adjoint_iterations: int
     adjoint_residual: float
-    young: Array | float | None = None
-    poisson: Array | float | None = None
-    density: Array | float | None = None
-    loads: Array | None = None
     boundary: Array | None = None
-    rest: Array | None = None
-    activation: Array | None = None
-    gravity: Array | None = None
-    obstacles: Array | None = None
-
-    def __getitem__(self, name: str) -> Any:
-        return parameters.requested(self, name, parameters.NEEDS)
 
 
 @under_lock
@@ -299,7 +288,8 @@ def static_gradient(
     positions = wp.array(solved.positions, dtype=dtype, device=body.device)
     value, derivative = value_and_derivative(objective, positions)
     found = solved.pull_back(derivative, names)
-    return StaticGradient(value, solved.report, solved.adjoint_iterations, solved.adjoint_residual, **found)
+    found |= {"adjoint_iterations": solved.adjoint_iterations, "adjoint_residual": solved.adjoint_residual}
+    return StaticGradient(value=value, report=solved.report, **found)
 
 
 class PreciseState:

@@ -9,7 +9,7 @@ late, and what is deep then is let out slowly.
 from __future__ import annotations
 
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -207,18 +207,26 @@ class SoftPairs:
                 "self_contact_margin is given, but the model has no triangles with edges that could touch: give "
                 "add_forest and add_mesh surface=True"
             )
-        self.margin, self.device = margin, model.device
+        self.margin = margin
         self._lists: Structs | None = None
         self.size = max(model.particle_count, model.edge_count)
-        triangles = model.tri_indices.numpy().reshape(-1, 3)
-        edges = model.edge_indices.numpy().reshape(-1, 4)
-        facing = _facing(model, triangles)
+        triangles, edges = model.tri_indices.numpy().reshape(-1, 3), model.edge_indices.numpy().reshape(-1, 4)
+        tets = model.tet_indices.numpy().reshape(-1, 4)
+        faces = boundary_faces(tets)[0]
+        # The face of tetrahedra that each triangle is, whose normal points out of them, and the triangles at edges.
+        face = _places(triangles, faces)
+        alike = np.any([(np.roll(faces[face], k, axis=1) == triangles).all(axis=1) for k in range(3)], axis=0)
+        facing = np.where(face < 0, 0.0, np.where(alike, 1.0, -1.0))
+        sides = np.stack([_places(edges[:, [k, 2, 3]], triangles) for k in range(2)], axis=1)
+        pairs = np.concatenate([node_pairs(tets)] + [triangles[:, [0, k]] for k in (1, 2)])
+        parts = np.full(model.particle_count, -1)
+        parts[triangles] = linked(pairs, model.particle_count)[triangles]
         self.surfaces = surfaces = explicit.Surfaces()
         surfaces.triangles, surfaces.edges = model.tri_indices, model.edge_indices
-        surfaces.facing = self._on_device(facing, wp.float32)
-        surfaces.outward = self._on_device(_triangles_of_edges(triangles, edges, facing), wp.vec2i)
-        surfaces.part = self._on_device(_parts(model, triangles), wp.int32)
         surfaces.rest = wp.clone(model.particle_q)
+        surfaces.facing = wp.array(facing, dtype=wp.float32, device=model.device)
+        surfaces.outward = wp.array(np.where(facing[sides] == 0.0, -1, sides), dtype=wp.vec2i, device=model.device)
+        surfaces.part = wp.array(parts, dtype=wp.int32, device=model.device)
 
     def lists_of(self, contacts: newton.Contacts) -> explicit.PairLists:
         """Newton's lists of pairs.
@@ -237,27 +245,6 @@ class SoftPairs:
             self._lists = Structs(explicit.PairLists, "", data, margin=self.margin, parallel=PARALLEL)
         return self._lists(data)
 
-    def _on_device(self, values: npt.NDArray[Any], dtype: type) -> wp.array:
-        return wp.array(values, dtype=dtype, device=self.device)
-
-
-def _facing(model: newton.Model, triangles: npt.NDArray[np.int32]) -> npt.NDArray[np.float32]:
-    """Whether triangles' normals point out of tetrahedra (1) or into them (-1); 0: the triangle is a face of none, or
-    of two.
-    """
-    faces = boundary_faces(model.tet_indices.numpy())[0]
-    place = _places(triangles, faces)
-    alike = [(np.roll(faces[place], k, axis=1) == triangles).all(axis=1) for k in range(3)]
-    return np.where(place < 0, 0.0, np.where(np.any(alike, axis=0), 1.0, -1.0)).astype(np.float32)
-
-
-def _triangles_of_edges(
-    triangles: npt.NDArray[np.int32], edges: npt.NDArray[np.int32], facing: npt.NDArray[np.float32]
-) -> npt.NDArray[np.int32]:
-    """Two triangles of tetrahedra at each edge, or -1, int32 [E, 2]."""
-    found = np.stack([_places(edges[:, [k, 2, 3]], triangles) for k in range(2)], axis=1)
-    return np.where(facing[found] == 0.0, -1, found).astype(np.int32)
-
 
 def _places(wanted: npt.NDArray[np.integer], among: npt.NDArray[np.integer]) -> npt.NDArray[np.integer]:
     """The place of each row among others with the same numbers in any order; -1: there is none."""
@@ -265,12 +252,3 @@ def _places(wanted: npt.NDArray[np.integer], among: npt.NDArray[np.integer]) -> 
     _, first, group = np.unique(both, axis=0, return_index=True, return_inverse=True)
     place = first[np.ravel(group)[len(among) :]]
     return np.where(place < len(among), place, -1)
-
-
-def _parts(model: newton.Model, triangles: npt.NDArray[np.int32]) -> npt.NDArray[np.int32]:
-    """Number of the connected body of each particle, -1 if it is on no triangle, int32 [P]."""
-    tets = model.tet_indices.numpy().reshape(-1, 4)
-    pairs = np.concatenate([node_pairs(tets)] + [triangles[:, [0, k]] for k in (1, 2)])
-    parts = np.full(model.particle_count, -1, np.int32)
-    parts[triangles] = linked(pairs, model.particle_count)[triangles]
-    return parts

@@ -25,6 +25,7 @@ from warp_corot.mesh.topology import connected
 from warp_corot.solvers.implicit.block_system import BlockSystem
 from warp_corot.solvers.implicit.conjugate_gradients import WorldSums
 from warp_corot.solvers.implicit.contact_solve import ContactSolve
+from warp_corot.solvers.implicit.operator import SolvedContact
 from warp_corot.solvers.implicit.preconditioners import BlockDiagonal
 from warp_corot.solvers.recorded import Replays
 
@@ -116,8 +117,8 @@ class TurnedPieces:
         wp.launch(kernels.turn_particles, len(self.positions), inputs, [self.positions], device=sums.device)
 
 
-class RowForces:
-    """Forces and stiffness of rows as functions of the motions in a step: a ``SolvedContact`` of ``ContactSolve``.
+class RowForces(SolvedContact):
+    """Forces and stiffness of rows as functions of the motions in a step. They have nothing to locate or to list.
 
     Args:
         contacts: The model's contacts.
@@ -162,9 +163,6 @@ class RowForces:
 
     # --- as a contact of solves, see ``SolvedContact`` ---------------------------------------------------------------
 
-    def locate(self, d: wp.array) -> None:
-        pass
-
     def update(self, d: wp.array, *, is_solved: bool = False) -> None:
         self._launch(kernels.update_springs, int(is_solved), d, self._rows)
 
@@ -173,12 +171,6 @@ class RowForces:
 
     def add_products(self, x: wp.array, y: wp.array) -> None:
         self._launch(kernels.add_row_forces, self._unknowns, self._rows, x, y)
-
-    def update_springs(self) -> None:
-        pass
-
-    def find_reached(self, d: wp.array, change: wp.array) -> None:
-        pass
 
     def add_slopes(
         self, d: wp.array, change: wp.array, search: wp.array, slopes: wp.array, *, apart: int | None = None

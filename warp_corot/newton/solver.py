@@ -17,9 +17,8 @@ from warp_corot.simulation.energy import Solves
 from .contact import Contacts
 from .implicit import ImplicitSteps
 from .library import CouplingInterface, ModelView, SolverBase, Step, newton
-from .others import Others
 from .scene import STATE, attribute_of, register_custom_attributes
-from .steps import Recordings, Report, Steps
+from .steps import Others, Recordings, Report, Steps
 from .substeps import SAFETY, Following, stable_steps
 from .tetrahedra import LAME, Tetrahedra
 
@@ -341,7 +340,7 @@ class SolverCorotated(SolverBase, CouplingInterface):
     def _find_stable_steps(self) -> None:
         given = self._given_stable_dt
         if given is None:
-            self.stable_dt, self.contact_dt = stable_steps(self.tetrahedra, self._others)
+            self.stable_dt, self.contact_dt = stable_steps(self.tetrahedra, self._others.stiff, self._others.contact)
         else:
             self.stable_dt = self.contact_dt = float(given)
         if self._following is not None:

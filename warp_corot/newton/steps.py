@@ -1,7 +1,8 @@
-"""The launches of a step, failures of worlds in it, and the reports of them to users."""
+"""The launches of a step, failures of worlds in it, the reports of them to users, and everything besides tetrahedra."""
 
 from __future__ import annotations
 
+import math
 import warnings
 from functools import partial
 from types import SimpleNamespace
@@ -16,9 +17,8 @@ from warp_corot.solvers.pace import Mapped
 from warp_corot.solvers.recorded import FlushedSubnormals, Replays
 
 from .contact import Contacts
-from .library import Step, newton
-from .others import Others, with_changes
-from .substeps import RETRIES, Following
+from .library import ModelView, SolverBase, SolverSemiImplicit, Step, newton
+from .substeps import RETRIES, Following, StiffParts
 from .tetrahedra import Tetrahedra
 
 #: A particle speed [m/s] that is a failure for any step.
@@ -29,6 +29,9 @@ FEW = 32
 FLAGS = {
     name: int(getattr(newton.StateFlags, name.upper())) for name in ("particle_q", "particle_qd", "body_q", "body_qd")
 }
+#: Effective number of contacts of a particle with others in a heap, for their total stiffness. A pair that moves
+#: against each other counts twice, and opposite contacts count with the square of the cosine of their directions.
+CONTACTS = 4.0
 #: What there is no room for, and what to do.
 _NO_ROOM = {
     int(kernels.TOO_MANY_PAIRS): "pairs of soft bodies than Newton has room for: call pipeline.init_soft_self_contact "
@@ -113,7 +116,7 @@ class Steps:
                     if self.device.is_cpu and not self.device.is_capturing:
                         left = following.count_for(dt - done)
                         each = (dt - done) / left
-                self._launch_gathered(step, now, each, before, following, done)
+                self._launch_substep(step, now, each, before, following, done, gathered=True)
             number, left, done = number + 1, left - 1, done + each
             now = step.state_out
         if self.others.has_bodies:
@@ -126,16 +129,19 @@ class Steps:
         self.report.launch()
 
     def _launch_substep(
-        self, step: Step, now: newton.State, each: float, before: list, following: Following | None
+        self,
+        step: Step,
+        now: newton.State,
+        each: float,
+        before: list,
+        following: Following | None,
+        done: float = 0.0,
+        *,
+        gathered: bool = False,
     ) -> None:
-        """Launch a substep that is not the first one."""
-        self._launch_gathering(now, step.state_in, 1, False)
-        self._launch_gathered(step, now, each, before, following, 0.0)
-
-    def _launch_gathered(
-        self, step: Step, now: newton.State, each: float, before: list, following: Following | None, done: float
-    ) -> None:
-        """Launch a substep from gathered positions, after some time of the step [s]."""
+        """Launch a substep after some time of the step [s], from positions that have been gathered or are to be."""
+        if not gathered:
+            self._launch_gathering(now, step.state_in, 1, False)
         substep = step._replace(state_in=now, dt=each)
         self._launch_forces(substep, step.state_in, each / step.dt, done)
         self._launch_motion(substep, RUNAWAY if following is None else min(RUNAWAY, following.reach / each))
@@ -253,6 +259,118 @@ class Steps:
 
     def _check_bodies(self, state: newton.State, wrong: int) -> None:
         self._launch(kernels.check_bodies, self.model.body_count, [self.contacts.bodies(state), int(wrong)])
+
+
+class Others:
+    """Steps of everything besides tetrahedra: rigid bodies and joints, springs, triangles and bending edges.
+
+    Another of Newton's solvers steps these, on a view of the model without tetrahedra.
+
+    Args:
+        model: The model.
+        rigid_solver: "semi-implicit", a user's solver, or None: bodies do not move.
+        particle_contact: Whether particles collide with one another.
+
+    Attributes:
+        has_particles: Whether particles are integrated here, because something besides tetrahedra acts on them.
+        has_bodies: Whether bodies are integrated here.
+        stiff: Springs, triangles and bending edges in small motions.
+        is_own: Whether the bodies' solver is the one that is made here.
+        contact: Stiffness [N/m] and damping [N s/m] of each contact between particles.
+        moved: Particles as the solvers of bodies have moved them in the last step, without the forces of this package:
+            positions and velocities, vec3 [P].
+    """
+
+    def __init__(self, model: newton.Model, rigid_solver: SolverBase | str | None, particle_contact: bool):
+        self.is_own = own = rigid_solver == "semi-implicit"
+        if not own and rigid_solver is not None and not isinstance(rigid_solver, SolverBase):
+            raise InputError(f"rigid_solver is {rigid_solver!r}; it must be 'semi-implicit', a solver or None")
+        self.model, self.device = model, model.device
+        self._particle_contact = particle_contact
+        if own or rigid_solver is None:
+            _warn_of_ignored(model)
+        self._triangles = triangles = bool(model.tri_count) and bool(np.any(model.tri_materials.numpy()))
+        self._edges = edges = bool(model.edge_count) and bool(np.any(model.edge_bending_properties.numpy()))
+        self.has_particles = bool(model.spring_count) or triangles or edges or particle_contact
+        self.has_bodies = bool(model.body_count) and rigid_solver is not None
+        self._rigid = rigid_solver if isinstance(rigid_solver, SolverBase) else None
+        self._solver: SolverSemiImplicit | None = None
+        if self.has_particles or (own and model.body_count):
+            view = ModelView(model, "warp_corot_others")
+            view.tet_count = 0
+            if not triangles:
+                view.tri_count = 0
+            if not edges:
+                view.edge_count = 0
+            if not self.has_particles:
+                view.particle_count = 0
+            if not particle_contact:
+                view.particle_grid = None
+            elif model.device.is_cpu and model.particle_grid is not None:
+                # About as many cells as particles: clearing Newton's two million would dominate a step.
+                size = 2 ** math.ceil(math.log2(max(model.particle_count, 1)) / 3)
+                view.particle_grid = wp.HashGrid(*3 * [min(max(size, 8), 128)], device=model.device)
+            if not own and model.body_count:
+                view.body_count = view.joint_count = 0
+            try:
+                self._solver = SolverSemiImplicit(view, enable_tri_contact=False)
+            except ValueError as error:
+                raise InputError(f"{error} Give another rigid_solver, or None.") from None
+        #: Copies of contacts without those of particles, by the original contacts.
+        self._rigid_contacts: tuple[newton.Contacts, newton.Contacts] | None = None
+        count = model.particle_count if self._solver is not None or self._rigid is not None else 0
+        self._no_forces, *self.moved = (wp.zeros(count, dtype=wp.vec3, device=model.device) for _ in range(3))
+        self.refresh()
+
+    def refresh(self) -> None:
+        """Read the current stiffness and damping of everything."""
+        model = self.model
+        acts = self._particle_contact and model.particle_grid is not None
+        self.contact = (CONTACTS * model.particle_ke, CONTACTS * model.particle_kd) if acts else (0.0, 0.0)
+        self.stiff = StiffParts(model, self._triangles, self._edges)
+
+    def step(self, substep: Step, body_f: wp.array | None) -> None:
+        """Make a step of bodies with the given wrenches, and of particles into ``moved``."""
+        if self.has_particles:
+            self._no_forces.zero_()  # Newton's solver adds its own
+        now = with_changes(substep.state_in, particle_f=self._no_forces, body_f=body_f)
+        out = with_changes(substep.state_out, particle_q=self.moved[0], particle_qd=self.moved[1])
+        rigid = self._without_soft(substep.contacts)
+        if self._solver is not None:
+            self._solver.step(now, out, substep.control, rigid, substep.dt)
+        if self._rigid is not None and self.has_bodies:
+            self._rigid.step(now, out, substep.control, rigid, substep.dt)
+
+    @property
+    def solvers(self) -> list[SolverBase]:
+        """The solvers that step all this."""
+        return [solver for solver in (self._solver, self._rigid) if solver is not None]
+
+    def _without_soft(self, contacts: newton.Contacts | None) -> newton.Contacts | None:
+        if contacts is None:
+            return None
+        if self._rigid_contacts is None or self._rigid_contacts[0] is not contacts:
+            self._rigid_contacts = contacts, with_changes(contacts, soft_contact_max=0)
+        return self._rigid_contacts[1]
+
+
+def _warn_of_ignored(model: newton.Model) -> None:
+    """Warn, in one line, of parts of a model that nothing steps."""
+    counts = {"tendons": model.tendon_count, "muscles": model.muscle_count}
+    there = [f"{count} {name}" for name, count in counts.items() if count]
+    if there:
+        warnings.warn(
+            f"the model has {' and '.join(there)}, which are ignored here; another rigid_solver may step them",
+            UserWarning,
+            stacklevel=4,
+        )
+
+
+def with_changes(given: Any, **changes: Any) -> Any:
+    """An object with the same attributes but for some; faster than ``copy.copy``, since it is made in every substep."""
+    made = object.__new__(type(given))
+    made.__dict__.update(vars(given), **changes)
+    return made
 
 
 class Report:

@@ -4,6 +4,7 @@ needs (see ``kernels.stepping.stability``)."""
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from functools import partial
 from typing import Any
@@ -13,6 +14,7 @@ import numpy.typing as npt
 import warp as wp
 
 from warp_corot.elasticity import Corotated
+from warp_corot.kernels.implicit.tangent import add_products
 from warp_corot.kernels.newton import elements as of_elements
 from warp_corot.kernels.newton.particles import Particles
 from warp_corot.kernels.stepping import stability
@@ -22,7 +24,6 @@ from warp_corot.solvers.pace import Mapped
 from warp_corot.solvers.stability import Curvature, largest_eigenvalue
 
 from .library import newton
-from .others import Others
 from .tetrahedra import Tetrahedra
 
 #: Number of substeps between measurements. A measurement takes about as long as four substeps.
@@ -41,6 +42,8 @@ STRIDE = 0.5
 #: Number of attempts to lengthen a step, and the largest eigenvalue, of 4, from which it is long enough.
 LENGTHENINGS = 6
 ENOUGH = 3.95
+#: Newton leaves out bending edges below twice this area and this length [m^2, m].
+LEAST = 1e-6
 #: The arrays of ``kernels.newton.elements.SafeSubstep`` on the device: names, shapes and types.
 SAFE: tuple[tuple[str, Any, Any], ...] = (
     *(("at_rest", (1, 4), wp.float64), ("found", (1, 3), wp.float32), ("allowed", 1, wp.float64)),
@@ -56,22 +59,22 @@ class _SmallMotions:
     its moduli.
     """
 
-    def __init__(self, tets: Tetrahedra, others: Others, a: float, b: float, at_particles: float):
-        self._tets, self._others, self._at_particles = tets, others.linear_forces(a, b), at_particles
+    def __init__(self, tets: Tetrahedra, stiff: StiffParts, a: float, b: float, at_particles: float):
+        self._tets, self._stiff, self._at_particles = tets, stiff.linear_forces(a, b), at_particles
         mu, lam, viscosity = (array.numpy().astype(np.float64) for array in (tets.mu, tets.lam, tets.k_damp))
         moduli = (a * mu + 0.5 * b * viscosity, a * lam + b * viscosity)
         self._moduli = [wp.array(m, dtype=wp.float32, device=tets.device) for m in moduli]
 
     def add_forces(self, u: wp.array, f: wp.array) -> None:
         self._tets.add_linear_forces(u, f, self._moduli)
-        self._others(u, f)
+        self._stiff(u, f)
         wp.launch(add_scaled, dim=len(u), inputs=[-self._at_particles, u], outputs=[f], device=u.device)
 
     def state_kept(self) -> AbstractContextManager[None]:
         return nullcontext()
 
 
-def stable_step(tets: Tetrahedra, others: Others, stiffness: float = 0.0, damping: float = 0.0) -> float:
+def stable_step(tets: Tetrahedra, stiff: StiffParts, stiffness: float = 0.0, damping: float = 0.0) -> float:
     """The largest stable step of symplectic Euler about rest [s]; infinite if nothing can move.
 
     It is stable while no eigenvalue of dt^2 M^-1 K + 2 dt M^-1 C is above 4. With w^2 the largest eigenvalue of M^-1 K
@@ -80,7 +83,7 @@ def stable_step(tets: Tetrahedra, others: Others, stiffness: float = 0.0, dampin
     bending edges about the model's initial positions, all together.
 
     Args:
-        tets, others: The parts of the model.
+        tets, stiff: The parts of the model.
         stiffness: Stiffness of a spring at every particle [N/m], for contact with other particles.
         damping: Damping of a damper at every particle [N s/m].
     """
@@ -89,11 +92,11 @@ def stable_step(tets: Tetrahedra, others: Others, stiffness: float = 0.0, dampin
     smallest = float(tets.elements.volume.numpy().astype(np.float64).min())
 
     def largest(a: float, b: float) -> float:
-        motions = _SmallMotions(tets, others, a, b, a * stiffness + b * damping)
+        motions = _SmallMotions(tets, stiff, a, b, a * stiffness + b * damping)
         return largest_eigenvalue(motions, inverse_mass, smallest, len(inverse))
 
     w2 = largest(1.0, 0.0)
-    c = largest(0.0, 1.0) if tets.damped or others.damped or damping > 0 else 0.0
+    c = largest(0.0, 1.0) if tets.damped or stiff.damped or damping > 0 else 0.0
     if w2 == 0.0 and c == 0.0:
         return math.inf
     dt = 4.0 / (c + math.sqrt(c * c + 4.0 * w2))
@@ -112,10 +115,11 @@ def free_inverse_masses(model: newton.Model) -> npt.NDArray[np.floating]:
     return np.where(active, model.particle_inv_mass.numpy(), 0.0)
 
 
-def stable_steps(tets: Tetrahedra, others: Others) -> tuple[float, float]:
-    """The largest stable step about rest [s], and the same with contacts of each particle with others."""
-    alone = stable_step(tets, others)
-    return alone, min(alone, stable_step(tets, others, *others.contact)) if any(others.contact) else alone
+def stable_steps(tets: Tetrahedra, stiff: StiffParts, contact: tuple[float, float]) -> tuple[float, float]:
+    """The largest stable step about rest [s], and the same with contacts of each particle with others of this stiffness
+    [N/m] and damping [N s/m]."""
+    alone = stable_step(tets, stiff)
+    return alone, min(alone, stable_step(tets, stiff, *contact)) if any(contact) else alone
 
 
 class Following:
@@ -236,3 +240,132 @@ def _size(model: newton.Model, tets: npt.NDArray[np.integer]) -> float:
     np.minimum.at(low, body, x)
     np.maximum.at(high, body, x)
     return float(np.linalg.norm(high - low, axis=1).max())
+
+
+# --- small motions of everything besides tetrahedra ------------------------------------------------------------------
+
+Array = npt.NDArray[np.float64]
+#: Nodes of elements [E, n], the matrix from their displacements to strains [E, s, 3 n], and the stiffness and damping
+#: of these [E, s, s].
+Elements = tuple[npt.NDArray[np.int32], Array, Array, Array]
+
+
+class StiffParts:
+    """Springs, triangles and bending edges of a model: the forces of ``newton.solvers.SolverSemiImplicit``, linearised
+    about the model's positions.
+
+    An element that is shorter or smaller there than at rest counts as if it were at rest, since that is its stiffer
+    state; a longer one also has its tension across it.
+
+    Args:
+        model: The model.
+        triangles, edges: Whether triangles and bending edges have a stiffness.
+
+    Attributes:
+        damped: Whether there are dampers.
+    """
+
+    def __init__(self, model: newton.Model, triangles: bool, edges: bool):
+        x, elements, self._device = model.particle_q.numpy().astype(np.float64), list[Elements](), model.device
+        if model.spring_count:
+            arrays = model.spring_rest_length, model.spring_stiffness, model.spring_damping
+            ends = model.spring_indices.numpy().reshape(-1, 2)
+            elements.append(_springs(x, ends, *(array.numpy() for array in arrays)))
+        if triangles:
+            arrays = model.tri_indices, model.tri_poses, model.tri_materials
+            elements.append(_triangles(x, *(array.numpy() for array in arrays)))
+        if edges:
+            nodes = model.edge_indices.numpy().reshape(-1, 4)
+            elements.append(_hinges(x, nodes, model.edge_bending_properties.numpy()))
+        pairs, blocks = [np.empty((0, 2), np.int32)], [np.empty((0, 2, 3, 3))]
+        for ids, strain, stiffness, damping in elements:
+            both = np.stack(np.broadcast_arrays(ids[:, :, None], ids[:, None, :]), axis=-1)
+            pairs.append(both.reshape(-1, 2))
+            sizes = (*ids.shape, 3, ids.shape[1], 3)
+            found = [np.einsum("esi,est,etj->eij", strain, m, strain).reshape(sizes) for m in (stiffness, damping)]
+            blocks.append(np.stack(found, axis=1).transpose(0, 2, 4, 1, 3, 5).reshape(-1, 2, 3, 3))
+        self._blocks = np.concatenate(blocks)
+        self._pairs = [wp.array(ids, dtype=wp.int32, device=self._device) for ids in np.concatenate(pairs).T]
+        self.damped = bool(self._blocks[:, 1].any())
+
+    def linear_forces(self, a: float, b: float) -> Callable[[wp.array, wp.array], None]:
+        """A function that adds -(a K + b C) u, with stiffness K and damping C, to f, both vec4 [P]."""
+        found = -(a * self._blocks[:, 0] + b * self._blocks[:, 1])
+        inputs = [*self._pairs, wp.array(found, dtype=wp.mat33, device=self._device)]
+        return lambda u, f: wp.launch(add_products, len(found), [*inputs, u], [f], device=self._device)
+
+
+def _springs(x: Array, ends: npt.NDArray[np.int32], rest: Array, stiffness: Array, damping: Array) -> Elements:
+    """K = k (d d^T + (1 - L/l) (1 - d d^T)) for the difference of a spring's ends and its direction d."""
+    used = (ends >= 0).all(axis=1)
+    ends, rest, stiffness, damping = ends[used], rest[used], stiffness[used], damping[used]
+    along, length = _split(x[ends[:, 0]] - x[ends[:, 1]])
+    whole = _outer(along, along)
+    tension = np.where(length > rest, 1.0 - rest / np.maximum(length, LEAST), 0.0)[:, None, None]
+    strain = np.broadcast_to(np.hstack([np.eye(3), -np.eye(3)]), (len(ends), 3, 6))
+    k, c = (a[:, None, None] for a in (stiffness, damping))
+    return ends, strain, k * (whole + tension * (np.eye(3) - whole)), c * whole
+
+
+def _triangles(x: Array, nodes: npt.NDArray[np.int32], pose: Array, materials: Array) -> Elements:
+    """K of the energy A (k_mu/2 F:F + k_lambda/2 (J - 1 - k_mu/k_lambda)^2), J = |F1 x F2|, and dampers of F and J."""
+    nodes, materials = nodes.reshape(-1, 3), materials.astype(np.float64)
+    mu, lam, rate = (m[:, None, None] for m in (materials[:, 0], np.maximum(materials[:, 1], 0.0), materials[:, 2]))
+    ends = np.concatenate([-pose.sum(axis=1, keepdims=True), pose], axis=1)  # [E, 3 nodes, 2 columns of F]
+    strain = np.einsum("eka,ij->eaikj", ends, np.eye(3)).reshape(-1, 6, 9)
+    area = (0.5 / np.linalg.det(pose))[:, None, None]
+    f1, f2 = np.einsum("eka,eki->aei", ends, x[nodes])
+    n, ratio = _split(np.cross(f1, f2))
+    flat = (ratio < LEAST)[:, None, None]  # there is no normal: at rest no strain is stiffer than the largest modulus
+    smaller = np.sqrt(np.clip(ratio, LEAST, 1.0))[:, None]
+    f1, f2, ratio = f1 / smaller, f2 / smaller, np.maximum(ratio, 1.0)[:, None, None]
+    widening = np.hstack([np.cross(f2, n), np.cross(n, f1)])
+    widening = _outer(widening, widening)
+    # Of the normal, which turns with the columns of F.
+    turning = (np.eye(3) - _outer(n, n)) @ np.concatenate([-_skew(f2), _skew(f1)], axis=2) / ratio
+    across = np.concatenate([_skew(f2) @ turning, -_skew(f1) @ turning], axis=1)
+    across[:, :3, 3:] -= _skew(n)
+    across[:, 3:, :3] += _skew(n)
+    tension = np.where(lam > 0.0, lam * (ratio - 1.0) - mu, 0.0)
+    stiffness = mu * np.eye(6) + lam * widening + tension * across
+    damping = rate * (np.eye(6) + (lam > 0.0) * widening)
+    stiffness = np.where(flat, 2.0 * np.maximum(mu, lam) * np.eye(6), stiffness)
+    return nodes, strain, area * stiffness, area * np.where(flat, 3.0 * rate * np.eye(6), damping)
+
+
+def _hinges(x: Array, nodes: npt.NDArray[np.int32], properties: Array) -> Elements:
+    """Dihedral angles near their rest values.
+
+    Newton's forces are e k (theta - theta_0) d, where d is the angle's gradient g with lengths in place of inverse
+    heights: K = e k d g^T. The symmetric part (K + K^T) / 2, used here, has an eigenvalue at least as large as the real
+    part of any of K.
+    """
+    used = (nodes >= 0).all(axis=1)
+    nodes, properties = nodes[used], properties[used].astype(np.float64)
+    i, j, k, o = (x[nodes[:, c]] for c in range(4))
+    n1, double1 = _split(np.cross(k - i, o - i))
+    n2, double2 = _split(np.cross(o - j, k - j))
+    e, length = _split(o - k)
+    acts = (double1 >= LEAST) & (double2 >= LEAST) & (length >= LEAST)
+    shares = [[-length, 0 * length], [0 * length, -length]]
+    shares += [[np.einsum("ei,ei->e", p - c, e) * s for c in (i, j)] for p, s in ((o, 1.0), (k, -1.0))]
+    parts = np.einsum("nhe,hei->hein", np.array(shares), np.stack([n1, n2])).transpose(0, 1, 3, 2)
+    heights = np.maximum([double1, double2], LEAST)[:, :, None, None]
+    strain = np.stack([parts.sum(axis=0), (parts / heights).sum(axis=0)], axis=1).reshape(len(nodes), 2, 12)
+    k_e, k_d = (np.where(acts, length * column, 0.0)[:, None, None] for column in properties.T[:2])
+    return nodes, strain, k_e * [[0.0, 0.5], [0.5, 0.0]], k_d * [[1.0, 0.0], [0.0, 0.0]]
+
+
+def _split(vectors: Array) -> tuple[Array, Array]:
+    """Directions of vectors and their lengths."""
+    length = np.linalg.norm(vectors, axis=1)
+    return vectors / np.where(length > 0.0, length, 1.0)[:, None], length
+
+
+def _outer(a: Array, b: Array) -> Array:
+    return a[:, :, None] * b[:, None, :]
+
+
+def _skew(v: Array) -> Array:
+    """The matrices of the products v x."""
+    return np.cross(v[:, None, :], np.eye(3)).swapaxes(1, 2)

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import warnings
+from functools import partial
 
 import numpy as np
 import numpy.typing as npt
 import warp as wp
 
 from warp_corot.discretization.discretization import FixedMesh
+from warp_corot.discretization.sizes import padded
 from warp_corot.elasticity import Corotated
 from warp_corot.elasticity.cpu import Lanes
 from warp_corot.elasticity.dilatation import ELEMENT
@@ -59,19 +61,16 @@ class ForestGroup:
         tets: npt.NDArray[np.integer],
         rotation_level: int | None,
     ):
-        self.forest, self.copies = forest, len(particles)
-        self.device = model.device
+        self.forest, self.copies, self.device = forest, len(particles), model.device
         self.rotation_level = rotation_level
         self.tets = (tets[:, None] + np.arange(len(forest.tets))).ravel()
         self.nodes = (particles[:, None] + np.arange(len(forest.points))).ravel()
         self.count = len(self.nodes)
         self.follow_one_another = bool((np.diff(self.nodes) == 1).all())
         # Displacements use the forest's own axes, so only a copy's position is subtracted, and no digits are lost.
-        rest = np.tile(forest.points, (self.copies, 1)).reshape(self.copies, -1, 3)
-        there = model.particle_q.numpy().astype(np.float64)[self.nodes].reshape(rest.shape)
-        rest = rest + (there - rest).mean(axis=1, keepdims=True)
-        self.rest = np.zeros((self.count, 4), np.float32)
-        self.rest[:, :3] = rest.reshape(-1, 3)
+        there = model.particle_q.numpy().astype(np.float64)[self.nodes].reshape(self.copies, -1, 3)
+        rest = forest.points + (there - forest.points).mean(axis=1, keepdims=True)
+        self.rest = padded(rest.reshape(-1, 3))
         #: Its nodes in arrays over particles; cached, since these arrays are the same in every step.
         self._parts: dict[int, wp.array] = {}
         if not self.follow_one_another:
@@ -197,22 +196,33 @@ class Tetrahedra:
     def __init__(self, model: newton.Model, lame: str, rotation_level: int | None):
         if not model.tet_count:
             raise InputError(_why_none(model))
-        self.model, self.lame = model, lame
-        self.device = model.device
-        self.tets = model.tet_indices.numpy().reshape(-1, 4)
-        self.elements = self._elements(np.arange(model.tet_count))
-        #: mu, lambda, k_lambda [Pa] and k_damp [Pa s] of all tetrahedra; and the last two for the kernel beside elastic
-        #: ones.
-        self._materials = self._room_for_materials(model.tet_count)
-        self.mu, self.lam, _, self.k_damp = self._materials
-        self._beside = self._room_for_materials(model.tet_count)[:2]
+        self.model, self.lame, self.device = model, lame, model.device
+        self._launch = partial(wp.launch, device=self.device)
+        self.tets, count = model.tet_indices.numpy().reshape(-1, 4), int(model.tet_count)
+        self.elements = self._elements(np.arange(count))
         self.groups: list[ForestGroup] = forest_groups(model, self.tets, rotation_level)
-        #: Whether the elastic kernel of single tetrahedra includes activation and damping.
-        self._fused, self._may_be_active = self.device.is_cuda, True
-        self._is_single = np.ones(model.tet_count, bool)
+        self._may_be_active, is_single = True, np.ones(count, bool)
         for group in self.groups:
-            self._is_single[group.tets] = False
-        self._take_single(np.flatnonzero(self._is_single))
+            is_single[group.tets] = False
+        self._single: npt.NDArray[np.intp] = np.flatnonzero(is_single)
+        self.single_count = len(self._single)
+        #: mu, lambda, k_lambda [Pa] and k_damp [Pa s] of all tetrahedra, and of those that are computed one by one.
+        self._materials = [self._zeros(count) for _ in range(4)]
+        self.mu, self.lam, _, self.k_damp = self._single_materials = self._materials
+        if self.groups:
+            self._single_materials = [self._zeros(self.single_count) for _ in range(4)]
+        self._single_ids = wp.array(self._single if self.groups else [], dtype=wp.int32, device=self.device)
+        #: Whether their elastic kernel includes activation and damping, so that no other is needed.
+        self._fused = self.device.is_cuda and not self.groups
+        self._no_activation = self._zeros(count)
+        self._no_velocities = wp.zeros(model.particle_count, dtype=wp.vec3, device=self.device)
+        if self.device.is_cuda:
+            self._posed = self.posed(self._single)
+        else:
+            elements = self._elements(self._single) if self.groups else self.elements
+            repair = repair_forces(GeneralElements, IsotropicMaterial, posed_stress)
+            self._lanes = Lanes(elements, elements, scatter=scatter_posed_lanes, repair=repair)
+        self._isotropic = Kept(IsotropicMaterial, *ISOTROPIC)
         rest = np.zeros((model.particle_count if self.groups else 0, 4), np.float32)
         for group in self.groups:
             rest[group.nodes] = group.rest
@@ -242,12 +252,9 @@ class Tetrahedra:
         bad = np.flatnonzero(~(materials[:, 2] >= 0))
         if len(bad):
             raise InputError(f"tetrahedron {bad[0]} has k_damp {materials[bad[0], 2]:g} Pa s; it must not be negative")
-        columns = [mu, lam, materials[:, 1], materials[:, 2]]
-        for arrays, chosen in ((self._materials, slice(None)), (self._single_materials, self._is_single)):
-            for array, column in zip(arrays, columns, strict=True):
-                array.assign(column[chosen].astype(np.float32))
-        for array, column in zip(self._beside, columns[2:], strict=True):
-            array.assign(np.where(self._fused & self._is_single, 0.0, column).astype(np.float32))
+        for k, column in enumerate((mu, lam, materials[:, 1], materials[:, 2])):
+            self._single_materials[k].assign(column[self._single].astype(np.float32))
+            self._materials[k].assign(column.astype(np.float32))
         self.damped = bool((materials[:, 2] > 0).any())
         for group in self.groups:
             group.set_material(mu, lam)
@@ -260,11 +267,13 @@ class Tetrahedra:
 
     def add_forces(self, state: newton.State, activation: wp.array, f: wp.array) -> None:
         """Add the forces [N] for a state, whose displacements have been gathered, to f, vec4 [P]."""
-        q, v = state.particle_q, state.particle_qd
-        self._add_forces(self.u, activation, v, f)
-        count = self.model.tet_count
-        if (self.damped or self._may_be_active) and not (self._fused and self.single_count == count):
-            inputs = [self.elements, *self._beside, count, activation, q, v]
+        q, v, count = state.particle_q, state.particle_qd, int(self.model.tet_count)
+        if self._fused:
+            self._add_forces(self.u, activation, v, f)
+            return
+        self.add_elastic_forces(self.u, f)
+        if self.damped or self._may_be_active:
+            inputs = [self.elements, *self._materials[2:], count, activation, q, v]
             self._launch(scatter_damping_and_activation(self.damped), -(-count // int(EACH)), inputs, [f])
 
     def add_elastic_forces(self, u: wp.array, f: wp.array) -> None:
@@ -298,37 +307,17 @@ class Tetrahedra:
         return posed
 
     def _add_forces(self, u: wp.array, activation: wp.array, v: wp.array, f: wp.array) -> None:
-        """Add elastic forces, and others in the same kernel."""
-        if self._fused and self.single_count:
-            inputs = [self._single, *self._single_materials, self._single_ids, activation, u, v]
-            self._launch(scatter_posed(self.damped), self.single_count, inputs, [f], BLOCK)
+        """Add elastic forces, and on CUDA others of single elements in the same kernel."""
+        if self.device.is_cuda and self.single_count:
+            inputs = [self._posed, *self._single_materials, self._single_ids, activation, u, v]
+            self._launch(scatter_posed(self.damped), self.single_count, inputs, [f], block_dim=BLOCK)
         elif self.single_count:
-            self._lanes.scatter_forces(self._single_isotropic(*self._single_materials[:2], 1), u, f)
+            self._lanes.scatter_forces(self._isotropic(*self._single_materials[:2], 1), u, f)
         for group in self.groups:
             group.add_forces(u, f)
 
-    def _take_single(self, ids: npt.NDArray[np.integer]) -> None:
-        """Set the tetrahedra that are computed one by one."""
-        self.single_count = len(ids)
-        # The kernel with damping and activation reads these, too.
-        room = (self.model.tet_count, self.model.particle_count) if self._fused else (0, 0)
-        self._no_activation = wp.zeros(room[0], dtype=wp.float32, device=self.device)
-        self._no_velocities = wp.zeros(room[1], dtype=wp.vec3, device=self.device)
-        everything = len(ids) == self.model.tet_count
-        if self._fused:
-            self._single = self.posed(ids)
-        else:
-            elements = self.elements if everything else self._elements(ids)
-            repair = repair_forces(GeneralElements, IsotropicMaterial, posed_stress)
-            self._lanes = Lanes(elements, elements, scatter=scatter_posed_lanes, repair=repair)
-        self._single_ids, self._single_materials = wp.empty(0, dtype=wp.int32, device=self.device), self._materials
-        self._single_isotropic = Kept(IsotropicMaterial, *ISOTROPIC)
-        if not everything:
-            self._single_ids = wp.array(ids, dtype=wp.int32, device=self.device)
-            self._single_materials = self._room_for_materials(len(ids))
-
-    def _room_for_materials(self, count: int) -> list[wp.array]:
-        return [wp.empty(count, dtype=wp.float32, device=self.device) for _ in range(4)]
+    def _zeros(self, count: int) -> wp.array:
+        return wp.zeros(count, dtype=wp.float32, device=self.device)
 
     def _elements(self, ids: npt.NDArray[np.integer]) -> GeneralElements:
         poses = self.model.tet_poses.numpy().reshape(-1, 3, 3)[ids]
@@ -342,6 +331,3 @@ class Tetrahedra:
             raise InputError(f"tetrahedron {ids[bad[0]]} has a rest volume of {volumes[bad[0]]:g} m^3")
         elements.volume = wp.array(volumes, dtype=wp.float32, device=self.device)
         return elements
-
-    def _launch(self, kernel: wp.Kernel, dim: int, inputs: list, outputs: list, block_dim: int = 256) -> None:
-        wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device, block_dim=block_dim)

@@ -94,35 +94,33 @@ class StageSimulation:
         if not (math.isfinite(self.fps) and self.fps > 0):
             raise InputError(f"fps is {self.fps:g}; it must be a positive number")
         self._is_implicit = integrator == "implicit"
-        self.parts = StageModel(self.scene, options or StageOptions(), checked_device(device))
-        model = self.parts.model
-        if self._is_implicit and self.parts.thickness is not None:
-            self.parts.thickness = None
-            self.parts.notes.append("soft bodies pass through one another in implicit steps")
+        self.parts = parts = StageModel(self.scene, options or StageOptions(), checked_device(device))
+        model = parts.model
+        if self._is_implicit and parts.thickness is not None:
+            parts.thickness = None
+            parts.notes.append("soft bodies pass through one another in implicit steps")
         self._given_dt, self.steps = dt, 0
         self.solver = self._new_solver(rigid, integrator, damping)
-        gap = self.parts.margin
-        if self._is_implicit:
-            gap += FAST / self.scene.units.metres * self._longest_step()
-        self._pipeline = newton.CollisionPipeline(model, soft_contact_gap=gap)
-        self._touch = self.parts.thickness is not None
-        if self.parts.thickness is not None:
+        gap = FAST / self.scene.units.metres * self._longest_step() if self._is_implicit else 0.0
+        self._pipeline = newton.CollisionPipeline(model, soft_contact_gap=parts.margin + gap)
+        self._touch = parts.thickness is not None
+        if parts.thickness is not None:
             # Nothing else of Newton's filter of neighbours is needed: a body does not push itself in its first shape.
             self._pipeline.init_soft_self_contact(
-                margin=self.parts.thickness,
-                gap=GAP * self.parts.thickness,
+                margin=parts.thickness,
+                gap=GAP * parts.thickness,
                 vertex_buffer_pre_alloc=ROOM,
                 edge_buffer_pre_alloc=2 * ROOM,
                 topological_filter_threshold=1,
             )
         self._contacts = self._pipeline.contacts()
         self._pipeline.collide(model.state(), self._contacts)
-        self.parts.warn_of_overlaps(self._contacts)
+        parts.warn_of_overlaps(self._contacts)
         self.state, self._kept = self._new_state(), self._new_state()
         # Shares its positions with the state; it has stresses, which are needed once a frame and not once a step.
         self._shown = model.state()
         self._shown.particle_q = self.state.particle_q
-        self._visuals = newton.geometry.DeformableVisuals(model) if self.parts.surface_points else None
+        self._visuals = newton.geometry.DeformableVisuals(model) if parts.surface_points else None
         # A step of a copy of the state: loading kernels within a recording would end it on some drivers.
         self.dt = min(self._longest_step(), 1e-6)
         self._step(self._new_state())
@@ -166,17 +164,12 @@ class StageSimulation:
         x, v = self.state.particle_q.numpy(), self.state.particle_qd.numpy()
         self.solver.write_attributes(self._shown)
         stress = self._shown.warp_corot.von_mises.numpy() * np.float32(self.scene.units.pressure)
-        surfaces = []
-        if self._visuals is not None:
-            points = self._visuals.update(self.state).points.numpy()
-            surfaces = [points[chosen] for chosen in parts.surface_points]
+        surfaces = [] if self._visuals is None else [self._visuals.update(self.state).points.numpy()]
+        surfaces = [points[chosen] for points in surfaces for chosen in parts.surface_points]
         surfaces += [x[particles].copy() for particles in parts.cloth]
+        positions, velocities = ([a[body.particles].copy() for body in parts.soft] for a in (x, v))
         return SceneState(
-            [x[body.particles].copy() for body in parts.soft],
-            [v[body.particles].copy() for body in parts.soft],
-            [stress[body.tets] for body in parts.soft],
-            self.body_poses(),
-            surfaces,
+            positions, velocities, [stress[body.tets] for body in parts.soft], self.body_poses(), surfaces
         )
 
     def writer(self, path: str | PathLike[str], *, show_stress: bool = False, flatten: bool = False) -> SceneWriter:
@@ -206,37 +199,30 @@ class StageSimulation:
     def body_poses(self) -> npt.NDArray[np.float64]:
         """Poses of the rigid bodies in the order of ``parts.rigid``, for row vectors, float64 [B, 4, 4]."""
         poses = np.zeros((len(self.parts.rigid), 4, 4))
-        if not len(poses):
-            return poses
-        every = self.state.body_q.numpy().astype(np.float64)[list(self.parts.rigid.values())]
-        poses[:, 3, :3], poses[:, 3, 3] = every[:, :3], 1.0
-        poses[:, :3, :3] = np.swapaxes(Rotation.from_quat(every[:, 3:]).as_matrix(), 1, 2)
+        if len(poses):
+            every = self.state.body_q.numpy().astype(np.float64)[list(self.parts.rigid.values())]
+            poses[:, 3, :3], poses[:, 3, 3] = every[:, :3], 1.0
+            poses[:, :3, :3] = np.swapaxes(Rotation.from_quat(every[:, 3:]).as_matrix(), 1, 2)
         return poses
 
     # --- pieces ----------------------------------------------------------------------------------------------------
 
     def _new_solver(self, rigid: str, integrator: str, damping: float) -> SolverCorotated:
-        model = self.parts.model
+        parts = self.parts
+        if rigid == "none" and (standing := [*parts.cables, *parts.rigid]):
+            parts.notes.append(f"stay where they are (--rigid none): {', '.join(standing)}")
         try:
             solver: Any = {"semi-implicit": rigid, "none": None}.get(rigid)
-            if rigid == "none" and (standing := [*self.parts.cables, *self.parts.rigid]):
-                self.parts.notes.append(f"stay where they are (--rigid none): {', '.join(standing)}")
             if rigid == "xpbd":
-                solver = newton.solvers.SolverXPBD(model)
-            substeps = None if self._given_dt is None else 1
-            return SolverCorotated(
-                model,
-                damping=damping,
-                integrator=integrator,
-                substeps=substeps,
-                rigid_solver=solver,
-                self_contact_margin=self.parts.thickness,
-            )
+                solver = newton.solvers.SolverXPBD(parts.model)
+            substeps, margin = None if self._given_dt is None else 1, parts.thickness
+            options: dict[str, Any] = {"damping": damping, "integrator": integrator, "substeps": substeps}
+            return SolverCorotated(parts.model, rigid_solver=solver, self_contact_margin=margin, **options)
         except ValueError as error:  # Newton's, and InputError, which is one
             said = str(error).replace(" Give another rigid_solver, or None.", "").rstrip(".")
             hint = f"; another than {rigid} can be chosen (--rigid)" if "does not support" in said else ""
-            if hint and self.parts.cables:
-                said = f"has cables, for example {self.parts.cables[0]}, which no solver here steps: {said}"
+            if hint and parts.cables:
+                said = f"has cables, for example {parts.cables[0]}, which no solver here steps: {said}"
                 hint = "; --rigid none leaves cables and rigid bodies in place"
             raise InputError(f"{self.scene.path}: {said}{hint}") from None
 

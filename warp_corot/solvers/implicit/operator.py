@@ -74,11 +74,13 @@ class Springs:
 
 
 class SolvedContact(Protocol):
-    """Forces as functions of the motions in a step, such as ``ImplicitContact``, which explains the members."""
+    """Forces as functions of the motions in a step, such as ``ImplicitContact``, which explains the members; some need
+    not do anything."""
 
     changed: wp.array
 
-    def locate(self, d: wp.array) -> None: ...
+    def locate(self, d: wp.array) -> None:
+        return
 
     def update(self, d: wp.array, *, is_solved: bool = False) -> None: ...
 
@@ -86,9 +88,11 @@ class SolvedContact(Protocol):
 
     def add_products(self, x: wp.array, y: wp.array) -> None: ...
 
-    def update_springs(self) -> None: ...
+    def update_springs(self) -> None:
+        return
 
-    def find_reached(self, d: wp.array, change: wp.array) -> None: ...
+    def find_reached(self, d: wp.array, change: wp.array) -> None:
+        return
 
     def add_slopes(
         self, d: wp.array, change: wp.array, search: wp.array, slopes: wp.array, *, apart: int | None = None
