@@ -15,8 +15,7 @@ from .batches import (
     node_place,
     shape_of_kind,
 )
-from .lists import LEAVES_OF_SUBTREE
-from .plan import Plan, Tree, extent, places_t
+from .plan import LEAVES_OF_SUBTREE, Plan, Tree, extent, places_t
 
 wp.set_module_options({"enable_backward": False})
 

@@ -18,7 +18,7 @@ from warp_corot.errors import InputError
 from warp_corot.kernels.elements.cpu import rest_matrices
 from warp_corot.kernels.elements.elements import ForestElements, GeneralElements, Subtrees
 from warp_corot.kernels.plan import batches as batch_kernels
-from warp_corot.kernels.plan import lists
+from warp_corot.kernels.plan import plan as lists
 from warp_corot.kernels.plan import slots as kernels
 from warp_corot.kernels.plan.plan import Plan, Tree, places_t
 from warp_corot.kernels.tables.shapes import MIRROR_BIT
