@@ -281,7 +281,7 @@ class CutPass(_Launches):
         surface = Surface()
         surface.stress = stress
         self._once(cut_kernels.begin_cut, 0, pools, cuts)
-        self._many(cut_kernels.list_all, pools, cuts)
+        self._many(cut_kernels.list_near, surface, carried, pools, cuts)
         self._many(cut_kernels.pull_faces, contents, carried, pools, cuts)
         self._many(cut_kernels.choose_faces, surface, pools, cuts)
         self._many(cut_kernels.tear_faces, pools, cuts)
