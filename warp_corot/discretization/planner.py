@@ -43,7 +43,7 @@ def tree_of(forest: TetForest, elements: ForestElements, rotation_level: int | N
     tree.leaf_count, tree.node_count = counts[:1], counts[1:]
     tree.named = int(forest.node_count == len(forest.lattice))
     tree.leaf_tets = elements.nodes
-    tree.parent_code = device_frames(device).of_parents
+    tree.parent_code = device_frames(device)[1]
     if isinstance(source, UniformTree):
         tree.uniform = 1
         level = source.depth if rotation_level is None else min(rotation_level, source.depth)
