@@ -14,7 +14,6 @@ import numpy as np
 import warp as wp
 
 import warp_corot as wc
-from warp_corot.discretization.elements import forest_elements
 
 sys.path.append(str(Path(__file__).resolve().parent.parent / "tests" / "support"))
 try:
@@ -163,4 +162,4 @@ class Problem:
         """The ancestor's rotation for each element of the sample [m, 3, 3]."""
         leaves = self.mesh.tree.leaves[self.sample.elements]
         ancestors = self.mesh.tree.ancestors(leaves, self.level - levels_up)
-        return self.rotations_of(forest_elements(self.mesh, ancestors, self.device).nodes.numpy())
+        return self.rotations_of(self.mesh.tree.rows(ancestors)[0])

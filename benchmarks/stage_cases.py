@@ -11,11 +11,12 @@ import work
 from measure import WRONG, Case
 from problem import GROUP_LEVELS, SUBTREE_LEVELS, Problem, oracle, relative_error
 
-from warp_corot.discretization.elements import forest_elements
+from warp_corot.discretization.elements import all_frames, device_elements
 from warp_corot.elasticity.polar import rotation_function
 from warp_corot.kernels.corotated.corotated import extract_rotations
 from warp_corot.kernels.elements.elements import ForestElements
 from warp_corot.kernels.math.rotation import byers_xu
+from warp_corot.mesh import TetForest
 
 #: Warp's SVD stops early.
 SVD_WRONG = 1e-2
@@ -36,6 +37,15 @@ def rotation_cases(problem: Problem) -> list[Case]:
             name = f"Byers-Xu, 4 iterations, {up} level{'s' * (up > 1)} up"
             cases.append(_rotation_case(problem, name, rotation_function("byers-xu", 4), up))
     return cases
+
+
+def forest_elements(mesh: TetForest, chosen: np.ndarray, device: wp.Device) -> ForestElements:
+    """Any tetrahedra of the tree, leaves or ancestors, as forest elements."""
+    tets, level = mesh.tree.rows(chosen)
+    elements = device_elements(mesh, device)
+    elements.nodes = elements.targets = wp.array(tets, dtype=wp.vec4i, device=device)
+    elements.code = wp.array(all_frames().codes(mesh.lattice, tets, level), dtype=wp.int32, device=device)
+    return elements
 
 
 def _rotation_case(

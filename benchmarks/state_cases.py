@@ -16,7 +16,6 @@ from solver_cases import put_back
 from state_bodies import GRAVITY, MATERIAL, State, Subject
 
 import warp_corot as wc
-from warp_corot.discretization.elements import forest_elements
 from warp_corot.elasticity import ForceField, Model
 from warp_corot.elasticity.dilatation import DilatationField, law_of
 from warp_corot.errors import InputError
@@ -327,7 +326,7 @@ class Bench:
         """F of the ancestor whose rotation each element of the sample shares [m, 3, 3]."""
         mesh = self.subject.mesh
         ancestors = mesh.ancestors(self.level - SUBTREE_LEVELS)[self.sample.elements]
-        tets = forest_elements(mesh, ancestors, self.device).nodes.numpy()
+        tets = mesh.tree.rows(ancestors)[0]
         used, local = np.unique(tets, return_inverse=True)
         at_rest = oracle.Mesh(mesh.points[used], local.reshape(-1, 4))
         return at_rest.deformation_gradients(mesh.points[used] + state.u[used].astype(float))

@@ -9,8 +9,7 @@ import warp as wp
 from warp_corot.kernels.elements.elements import LEVEL_MASK
 from warp_corot.kernels.tables.shapes import MIRROR_BIT
 
-from .lists import LEAVES_OF_SUBTREE
-from .plan import SINKS, Plan, Tree, code_above, extent, flat_row, places_t, sink
+from .plan import LEAVES_OF_SUBTREE, SINKS, Plan, Tree, code_above, extent, flat_row, places_t, sink
 
 wp.set_module_options({"enable_backward": False})
 
@@ -50,7 +49,7 @@ class FlatLeaves:
 
 @wp.func
 def kind_of_class(c: int, plan: Plan):
-    """Shape and sharing of a class; see ``lists.kind_of``."""
+    """Shape and sharing of a class; see ``plan.kind_of``."""
     return c / plan.members
 
 

@@ -1,22 +1,13 @@
-"""Numbers for slots: a place of its own for every force that a unit of work adds; see ``elements.elements``.
+"""Slots: a place of its own for every force that a unit of work adds; see ``elements.elements``.
 
-Slots of a world stand class after class, subtree after subtree or group after group, then those of the leaves in no
-subtree. A group has all its 40 places, those that it does not use included.
+The slot of a node of a subtree, or of its group, is its place in ``Batches.nodes``; those of the leaves in no subtree
+follow, four each.
 """
 
 import warp as wp
 
-from .batches import (
-    GROUP_NODES,
-    Batches,
-    is_grouped,
-    kind_of_class,
-    node_count,
-    node_place,
-    shape_of_kind,
-)
-from .lists import LEAVES_OF_SUBTREE
-from .plan import Plan, Tree, extent, places_t
+from .batches import Batches, is_grouped, kind_of_class, node_count, node_place, shape_of_kind
+from .plan import LEAVES_OF_SUBTREE, Plan, Tree, extent
 
 wp.set_module_options({"enable_backward": False})
 
@@ -25,14 +16,11 @@ wp.set_module_options({"enable_backward": False})
 class Targets:
     """Which slots forces are added to."""
 
-    begin: places_t  # of each class, then of the leaves in none
-    per_world: int
     # Nodes of each leaf of a subtree or group as places of that, by shape.
     leaf_places: wp.array2d[wp.vec4i]  # [3, 8]
     group_leaf_places: wp.array2d[wp.vec4i]  # [3, 64]
-    nodes: wp.array[wp.int32]  # the node of each slot of one world, and ``no_node`` for slots that are not used
-    no_node: int
-    of_subtrees: wp.array[wp.int32]  # as ``Batches.nodes``
+    nodes: wp.array[wp.int32]  # the node of each slot, a number past the last node if it is not used
+    of_subtrees: wp.array[wp.int32]  # as ``Batches.nodes``; -1 where there is no node
     of_leaves: wp.array[wp.vec4i]  # of all leaves, in a subtree or not
 
 
@@ -45,82 +33,52 @@ def target_subtrees(
     # Out
     targets: Targets,
 ):
-    """Number the slots of one class, and of its leaves, with each row of threads."""
+    """Name the slots of one class, and of its leaves, with each row of threads."""
     c, t = wp.tid()
     shape = shape_of_kind(kind_of_class(c, plan), plan)
-    grouped = is_grouped(c, plan)
-    count = extent(c, plan)
-    for k in range(t, plan.worlds * count, threads):
-        world = k / count
-        in_world = k - world * count
-        start = world * targets.per_world + targets.begin[c]
-        behind = int(0)
-        if grouped:
-            start += GROUP_NODES * (in_world / 8)
-            behind = 5 * (k % 8)
-        else:
-            start += node_count(c, plan) * in_world
+    for k in range(t, plan.worlds * extent(c, plan), threads):
         for n in range(node_count(c, plan)):
-            slot = start + behind + n
             place = node_place(c, k, n, plan, batches)
-            node = batches.nodes[place]
-            if world == 0:
-                targets.nodes[slot] = wp.where(node < 0, targets.no_node, node)
-            targets.of_subtrees[place] = wp.where(node < 0, -1, slot)
+            if batches.nodes[place] >= 0:
+                targets.nodes[place] = batches.nodes[place]
+                targets.of_subtrees[place] = place
         first = plan.first[plan.begin[c] + k]
         for leaf in range(LEAVES_OF_SUBTREE):
-            own = wp.vec4i(0)
-            if grouped:
+            own = targets.leaf_places[shape, leaf]
+            unit = int(k)
+            if is_grouped(c, plan):
                 own = targets.group_leaf_places[shape, LEAVES_OF_SUBTREE * (k % 8) + leaf]
-            else:
-                own = targets.leaf_places[shape, leaf]
-            targets.of_leaves[first + leaf] = own + wp.vec4i(start, start, start, start)
+                unit -= k % 8
+            for n in range(4):
+                own[n] = node_place(c, unit, own[n], plan, batches)
+            targets.of_leaves[first + leaf] = own
 
 
 @wp.kernel(enable_backward=False)
 def target_flat(
     # In
+    begin: int,
     plan: Plan,
     tree: Tree,
     # Out
     targets: Targets,
 ):
-    """Number the slots of the leaves in no subtree."""
-    world, k = wp.tid()
-    start = targets.begin[plan.classes] + 4 * k
+    """Name the slots of the leaves in no subtree, which begin at a number."""
+    k = wp.tid()
     i = plan.flat[k]
-    if world == 0:
-        for n in range(4):
-            targets.nodes[start + n] = tree.leaf_tets[i][n]
-    start += world * targets.per_world
-    targets.of_leaves[world * plan.world_leaves + i] = wp.vec4i(start, start + 1, start + 2, start + 3)
+    start = begin + 4 * k
+    for n in range(4):
+        targets.nodes[start + n] = tree.leaf_tets[i][n]
+    targets.of_leaves[i] = wp.vec4i(start, start + 1, start + 2, start + 3)
 
 
 @wp.kernel(enable_backward=False)
 def find_starts(
     # In
     count: int,
-    world_nodes: int,
-    there: int,
     nodes: wp.array[wp.int32],
     # Out
     starts: wp.array[wp.int32],
 ):
-    """Where each node's slots begin among ``count`` slots sorted by node, ``there`` of which are used."""
-    world, node = wp.tid()
-    # The end of one world is the start of the next.
-    starts[world * world_nodes + node] = world * there + wp.lower_bound(nodes, 0, count + 1, node)
-
-
-@wp.kernel(enable_backward=False)
-def order_slots(
-    # In
-    per_world: int,
-    there: int,
-    sorted_slots: wp.array[wp.int32],
-    # Out
-    order: wp.array[wp.int32],
-):
-    """The slots by node, of all worlds."""
-    world, i = wp.tid()
-    order[world * there + i] = sorted_slots[i] + world * per_world
+    """Where each node's slots begin among ``count`` slots sorted by node; there is room for one more."""
+    starts[wp.tid()] = wp.lower_bound(nodes, 0, count + 1, wp.tid())

@@ -166,14 +166,15 @@ def list_near(
     pools: Pools,
     cuts: Cuts,
 ):
-    """List the leaves near a surface."""
+    """List the leaves near a surface; all, if faces tear."""
     near = wp.where(surface.is_deformed > wp.float64(0.0), NEAR_DEFORMED, NEAR)
     for i in range(wp.tid(), pools.counts[LEAVES], threads):
         tet = pools.leaf_tets[i]
         if is_far(i, near + wp.float64(1.0), surface, pools, carried):
             continue
         x = centroid(tet, surface.is_deformed, pools, carried)
-        if is_near(x, near * radius(tet, x, surface.is_deformed, pools, carried), surface):
+        far = near * radius(tet, x, surface.is_deformed, pools, carried)
+        if surface.stress > 0.0 or is_near(x, far, surface):
             add_star(i, pools, cuts)
 
 
@@ -425,19 +426,6 @@ def mark_bisected(
             for face in range(4):
                 if (pools.cut[e] >> face) % 2 == 1:
                     mark_face(pools.tets[e], face, carried, cuts)
-
-
-@wp.kernel(enable_backward=False)
-def list_all(
-    # In
-    threads: int,
-    # In and out
-    pools: Pools,
-    cuts: Cuts,
-):
-    """List all leaves."""
-    for i in range(wp.tid(), pools.counts[LEAVES], threads):
-        add_star(i, pools, cuts)
 
 
 @wp.kernel(enable_backward=False)

@@ -100,15 +100,6 @@ def list_followers(
                 wp.atomic_add(found, MIXED, 1)
 
 
-@wp.func
-def gathered_axes(plan: Plan, row: int, i: int):
-    return wp.mat33(
-        plan.values[row, i], plan.values[row + 1, i], plan.values[row + 2, i],
-        plan.values[row + 3, i], plan.values[row + 4, i], plan.values[row + 5, i],
-        plan.values[row + 6, i], plan.values[row + 7, i], plan.values[row + 8, i],
-    )  # fmt: skip
-
-
 @wp.kernel(enable_backward=False)
 def assemble_materials(
     # In
@@ -129,8 +120,9 @@ def assemble_materials(
         is_leaf = i < pools.counts[LEAVES]
         if axes_row >= 0:
             m = identity3()
-            if is_leaf:
-                m = gathered_axes(plan, axes_row, i)
+            for n in range(9):
+                if is_leaf:
+                    m[n / 3, n % 3] = plan.values[axes_row + n, i]
             axes[i] = m
         if stiffness_row >= 0:
             c = vec9()

@@ -75,6 +75,6 @@ def test_no_threshold_gives_more_elements_of_those_allowed(resolved):
     counts = np.array([coarsening.mesh(least)[0] for least in np.append(np.unique(needs), 0.0)])
     assert len(np.unique(counts)) > 40
     for target in np.quantile(counts, np.linspace(0.1, 0.9, 9)).astype(int) + 1:
-        found = coarsening.mesh(coarsening.threshold(target, 0.0))[0]
+        found = coarsening.mesh(coarsening.threshold_of(target, 0.0))[0]
         assert found == counts[counts <= target].max()
-    assert coarsening.threshold(10**9, 0.25) == 0.25
+    assert coarsening.threshold_of(10**9, 0.25) == 0.25

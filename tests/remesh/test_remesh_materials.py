@@ -262,7 +262,7 @@ def test_keyframes_that_nobody_follows_are_forgotten(device):
     for n in range(8):
         body.activate(wc.Activation(TIMES + sim.time, np.outer(STRESS, np.full(body.element_count, n))))
         sim.advance_steps(2)
-    keys = sim.remeshing.changing[0].conditions.activation.keyframes.keys
+    keys = sim.remeshing.changing[0].conditions.of_activation.keys
     assert len(keys) <= 2
     assert max(each.end for each in keys) <= 3 * body.element_count
 

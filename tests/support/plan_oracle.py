@@ -9,7 +9,7 @@ import numpy as np
 from warp_corot.discretization.elements import frame_keys, frame_table, in_worlds
 from warp_corot.discretization.plan import Sharing
 from warp_corot.discretization.planner import subtree_nodes
-from warp_corot.kernels.tables.subtree import GROUP_NODES, LEAVES, group_leaves, group_nodes
+from warp_corot.kernels.tables.subtree import GROUP_NODES, group_nodes
 
 SUBTREE_LEVELS = 3
 GROUP_LEVELS = 6
@@ -47,14 +47,13 @@ class OracleUnits:
 
 @dataclass
 class OracleBatch:
-    """Subtrees of one shape and sharing: first leaves, nodes and targets by unit of work, and codes of roots."""
+    """Subtrees of one shape and sharing: first leaves, nodes by unit of work, and codes of roots."""
 
     shape: int
     grouped: bool
     sharing: Sharing
     first: np.ndarray
     nodes: np.ndarray
-    targets: np.ndarray
     codes: np.ndarray
     frames: np.ndarray
 
@@ -70,20 +69,15 @@ class OraclePlan:
         batches: ``OracleBatch``es.
         flat: The other leaves, int32.
         units: ``OracleUnits`` if a batch or a single leaf needs them, else None.
-        starts, order, per_world, targets, flat_targets: Of slots, if each unit of work has its own.
     """
 
-    def __init__(self, forest, rotation_level=None, *, worlds=1, grouped=False, deterministic=False):
+    def __init__(self, forest, rotation_level=None, *, worlds=1, grouped=False):
         self.forest, self.worlds = forest, worlds
         members, flat = in_batches(forest, rotation_level, grouped)
         count, nodes = len(forest.tets), len(forest.points)
         of_nodes = [self._of_leaves(member, forest.tets) for member in members]
-        of_targets, target_count = of_nodes, nodes
-        if deterministic:
-            of_targets = self._number_slots(members, of_nodes, flat)
-            target_count = self.per_world
         self.batches = []
-        for (shape, kind, sharing, first), own, targets in zip(members, of_nodes, of_targets, strict=True):
+        for (shape, kind, sharing, first), own in zip(members, of_nodes, strict=True):
             roots, level = forest.tree.rows(forest.tree.above(forest.tree.leaves[first], SUBTREE_LEVELS))
             codes, frames = shape_codes(forest.lattice, roots, level)
             self.batches.append(
@@ -93,7 +87,6 @@ class OraclePlan:
                     sharing,
                     in_worlds(first, worlds, count),
                     in_worlds(own, worlds, nodes),
-                    in_worlds(targets, worlds, target_count),
                     np.tile(codes, worlds),
                     frames,
                 )
@@ -114,31 +107,6 @@ class OraclePlan:
         found = np.full((len(first) // 8, GROUP_NODES), -1, np.int32)
         found[:, : len(places)] = values[first[::8, None] + places[:, 0], places[:, 1]]
         return found
-
-    def _number_slots(self, members, of_nodes, flat):
-        forest, worlds = self.forest, self.worlds
-        units = [*of_nodes, forest.tets[flat]]
-        node = np.concatenate([nodes.ravel() for nodes in units])
-        self.per_world = len(node)
-        there = np.flatnonzero(node >= 0)
-        order = there[np.argsort(node[there], kind="stable")].astype(np.int32)
-        ends = np.cumsum(np.bincount(node[there], minlength=len(forest.points)))
-        self.starts = np.concatenate([[0], in_worlds(ends, worlds, len(order))])
-        self.order = in_worlds(order, worlds, self.per_world)
-        number = np.where(node < 0, -1, np.arange(len(node))).astype(np.int32)
-        *of_targets, of_flat = (
-            part.reshape(nodes.shape)
-            for part, nodes in zip(np.split(number, np.cumsum([n.size for n in units])[:-1]), units, strict=True)
-        )
-        targets = np.empty_like(forest.tets)
-        targets[flat] = of_flat
-        for (shape, grouped, _, first), own in zip(members, of_targets, strict=True):
-            places = np.array(group_leaves(shape) if grouped else LEAVES[shape])
-            starts = first[::8] if grouped else first
-            targets[starts[:, None] + np.arange(64 if grouped else 8)] = own[:, places]
-        self.targets = in_worlds(targets, worlds, self.per_world)
-        self.flat_targets = in_worlds(of_flat, worlds, self.per_world)
-        return of_targets
 
 
 def in_batches(forest, rotation_level, grouped):

@@ -54,6 +54,8 @@ class Discretization(ABC):
         has_activation: Whether an active stress was set.
         smallest_volume: The volume of the smallest element [m^3].
         team: The threads of the CPU that compute forces; one on CUDA and for a mesh that changes.
+        is_uniform: Whether all elements of a world have the same elastic constants and are filled.
+        is_anisotropic: Whether the material has directions.
         awaited: Nodes that other processes move, if some wait for them; else None.
         sums_by_subtrees: Whether deterministic forces are summed subtree by subtree, never in groups of subtrees
             (CUDA), so that they are the same bits in a part of the mesh.
@@ -73,6 +75,8 @@ class Discretization(ABC):
     has_activation: bool
     smallest_volume: float
     team: Team
+    is_uniform: bool
+    is_anisotropic: bool
     awaited: Awaited | None = None
     sums_by_subtrees: bool = False
     _levels: Levels | None = None
@@ -126,18 +130,6 @@ class Discretization(ABC):
     @abstractmethod
     def anisotropic_material(self) -> OrthotropicMaterial:
         """The anisotropic material for kernels, world after world if it is not uniform."""
-
-    @property
-    def is_anisotropic(self) -> bool:
-        """Whether the material has directions."""
-        return isinstance(self.material, Directional)
-
-    @property
-    def is_uniform(self) -> bool:
-        """Whether all elements of a world have the same elastic constants and are filled."""
-        isotropic = self.material.isotropic
-        shapes = [np.shape(value) for value in (isotropic.young, isotropic.poisson)]
-        return self.fill is None and all(not shape or shape[-1] == 1 for shape in shapes)
 
     def make_activation(self) -> bool:
         """Make an active stress for every element if there is none; return whether there was none."""
@@ -223,12 +215,13 @@ class FixedMesh(Discretization):
 
     def _fill_in(self, mesh: Mesh, mu: npt.ArrayLike, lam: npt.ArrayLike, worlds: int, device: wp.Device) -> None:
         self._mesh, self.worlds, self.device, self.team = mesh, worlds, device, team_of(1)
+        self.is_anisotropic = isinstance(self._material, Directional)
         self.sizes = Sizes.of(worlds, len(mesh.points), len(mesh.tets))
         self.smallest_volume = float(np.min(mesh.volumes))
         self.element_kind = element_kind(mesh)
         self.elements = device_elements(mesh, device, worlds)
         self.fill = getattr(mesh, "fill", None)
-        self._is_uniform = self.fill is None and all(np.ndim(a) == 0 or np.shape(a)[-1] == 1 for a in (mu, lam))
+        self.is_uniform = self.fill is None and all(np.ndim(a) == 0 or np.shape(a)[-1] == 1 for a in (mu, lam))
         self.lame = self._lame_arrays(mu, lam, None)
         self.mu, self.lam, self.material_stride = self._lame_arrays(mu, lam, self.fill)
         self.activation, self.has_activation = wp.zeros(1, dtype=wp.float32, device=device), False
@@ -244,14 +237,6 @@ class FixedMesh(Discretization):
     @property
     def masses(self) -> npt.NDArray[np.float64]:
         return self._masses
-
-    @property
-    def is_uniform(self) -> bool:
-        return self._is_uniform
-
-    @property
-    def is_anisotropic(self) -> bool:
-        return isinstance(self._material, Directional)
 
     @property
     def prefers_subtrees(self) -> bool:

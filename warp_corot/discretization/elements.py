@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Iterator
-from typing import NamedTuple, Protocol, TypeAlias, TypeVar, cast
+from typing import Any, NamedTuple, TypeAlias, TypeVar, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -121,24 +121,15 @@ def all_frames() -> FrameTable:
     return FrameTable(frames, bits, of_children, of_parents)
 
 
-class DeviceFrames(NamedTuple):
-    """``FrameTable.frames`` and ``of_parents`` on a device."""
-
-    frames: wp.array
-    of_parents: wp.array
-
-
-def device_frames(device: wp.Device) -> DeviceFrames:
-    """The tables on a device. All its forests share them."""
+def device_frames(device: wp.Device) -> tuple[wp.array, wp.array]:
+    """``FrameTable.frames`` and ``of_parents`` on a device. All its forests share them."""
     return _device_frames(device.alias)
 
 
 @functools.cache
-def _device_frames(alias: str) -> DeviceFrames:
-    table = all_frames()
-    return DeviceFrames(
-        wp.array(table.frames, dtype=wp.mat33, device=alias), wp.array(table.of_parents, dtype=wp.int32, device=alias)
-    )
+def _device_frames(alias: str) -> tuple[wp.array, wp.array]:
+    frames, parents = all_frames().frames, all_frames().of_parents
+    return wp.array(frames, dtype=wp.mat33, device=alias), wp.array(parents, dtype=wp.int32, device=alias)
 
 
 def _keys(lattice: np.ndarray, tets: np.ndarray, level: int) -> np.ndarray:
@@ -161,18 +152,16 @@ def element_kind(mesh: Mesh) -> ElementKind:
 
 def device_elements(mesh: Mesh, device: wp.Device, worlds: int = 1) -> Elements:
     """The mesh's elements as an instance of its ``element_kind`` on ``device``, world after world."""
-    if isinstance(mesh, TetForest):
-        return _forest_elements(mesh, mesh.tets, mesh.levels, device, worlds)
-    return general_elements(mesh, device, worlds)
-
-
-def forest_elements(forest: TetForest, chosen: np.ndarray, device: wp.Device, worlds: int = 1) -> ForestElements:
-    """Any tetrahedra of the tree, leaves or ancestors, as forest elements.
-
-    Args:
-        chosen: Indices into the tree [n].
-    """
-    return _forest_elements(forest, *forest.tree.rows(chosen), device, worlds)
+    if not isinstance(mesh, TetForest):
+        return general_elements(mesh, device, worlds)
+    code = all_frames().codes(mesh.lattice, mesh.tets, mesh.levels)
+    elements = ForestElements()
+    elements.nodes = wp.array(in_worlds(mesh.tets, worlds, len(mesh.points)), dtype=wp.vec4i, device=device)
+    elements.targets = elements.nodes
+    elements.code = wp.array(repeated(code, worlds), dtype=wp.int32, device=device)
+    elements.frames = device_frames(device)[0]
+    elements.size = edge_lengths(mesh, device)
+    return elements
 
 
 def in_worlds(indices: np.ndarray, worlds: int, count: int) -> np.ndarray:
@@ -207,27 +196,8 @@ def with_targets(elements: E, targets: wp.array) -> E:
 def copied(struct: S) -> S:
     """Another instance of a Warp struct, with the same arrays and numbers."""
     other = type(struct)()
-    cast("Assigned", other).assign(struct)
+    cast("Any", other).assign(struct)
     return other
-
-
-class Assigned(Protocol):
-    """The common members of Warp structs."""
-
-    def assign(self, other: object) -> None: ...
-
-
-def _forest_elements(
-    forest: TetForest, tets: np.ndarray, level: np.ndarray, device: wp.Device, worlds: int
-) -> ForestElements:
-    code = all_frames().codes(forest.lattice, tets, level)
-    elements = ForestElements()
-    elements.nodes = wp.array(in_worlds(tets, worlds, len(forest.points)), dtype=wp.vec4i, device=device)
-    elements.targets = elements.nodes
-    elements.code = wp.array(repeated(code, worlds), dtype=wp.int32, device=device)
-    elements.frames = device_frames(device).frames
-    elements.size = edge_lengths(forest, device)
-    return elements
 
 
 def edge_lengths(forest: TetForest, device: wp.Device) -> wp.array:

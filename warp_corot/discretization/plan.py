@@ -20,7 +20,7 @@ from warp_corot.discretization.elements import Elements, in_worlds
 from warp_corot.errors import InputError
 from warp_corot.inputs.cpu_threads import launch, part_of
 from warp_corot.kernels.elements.elements import GeneralElements, Subtrees, gather_slots
-from warp_corot.kernels.plan.slots import find_starts, order_slots
+from warp_corot.kernels.plan.slots import find_starts
 
 if TYPE_CHECKING:
     from .changing.plan import DevicePlan
@@ -40,35 +40,29 @@ class Slots:
     Attributes:
         starts: The beginning of each node's entries in ``order``, and the end of the last, int32 [worlds * N + 1].
         order: The slots that each node sums, int32.
-        values: Forces, vec4 [worlds * per_world].
-        per_world: How many slots there are in a world.
+        values: Forces, vec4 [slots].
     """
 
     starts: wp.array
     order: wp.array
     values: wp.array
-    per_world: int
 
     @classmethod
-    def of_nodes(cls, nodes: wp.array, per_world: int, used: int, node_count: int, worlds: int) -> Slots:
+    def of_nodes(cls, nodes: wp.array, used: int, node_count: int) -> Slots:
         """Slots by the node that each belongs to.
 
         Args:
-            nodes: Nodes of the slots of one world, ``node_count`` for unused slots, and as many further places, int32
-                [2 * per_world]. It is overwritten.
-            per_world: How many slots there are in a world.
+            nodes: Nodes of the slots, ``node_count`` for unused slots, and as many further places, int32 [2 * slots].
+                It is overwritten.
             used: Number of used slots.
-            node_count: Number of nodes of one world.
+            node_count: Number of nodes.
         """
-        device = nodes.device
+        count, device = len(nodes) // 2, nodes.device
         slots = wp.array(np.arange(len(nodes)), dtype=wp.int32, device=device)
-        wp.utils.radix_sort_pairs(nodes, slots, per_world)
-        starts = wp.empty(worlds * node_count + 1, dtype=wp.int32, device=device)
-        inputs = [per_world, node_count, used, nodes]
-        wp.launch(find_starts, (worlds, node_count + 1), inputs, [starts], device=device)
-        order = wp.empty(worlds * used, dtype=wp.int32, device=device)
-        wp.launch(order_slots, (worlds, used), [per_world, used, slots], [order], device=device)
-        return cls(starts, order, wp.zeros(worlds * per_world, dtype=wp.vec4, device=device), per_world)
+        wp.utils.radix_sort_pairs(nodes, slots, count)
+        starts = wp.empty(node_count + 1, dtype=wp.int32, device=device)
+        wp.launch(find_starts, len(starts), [count, nodes], [starts], device=device)
+        return cls(starts, wp.clone(slots[:used]), wp.zeros(count, dtype=wp.vec4, device=device))
 
     @classmethod
     def of_units(
@@ -87,11 +81,11 @@ class Slots:
             InputError: There are more slots than can be numbered.
         """
         check_slots(worlds * units.size)
-        nodes = wp.empty(2 * units.size, dtype=wp.int32, device=device)
-        nodes[: units.size].assign(np.ascontiguousarray(units, dtype=np.int32).ravel())
-        numbers = np.arange(units.size, dtype=np.int32).reshape(units.shape)
-        slots = cls.of_nodes(nodes, units.size, units.size, node_count, worlds)
-        return slots, in_worlds(numbers, worlds, units.size)
+        named = in_worlds(np.asarray(units, np.int32), worlds, node_count)
+        nodes = wp.empty(2 * named.size, dtype=wp.int32, device=device)
+        nodes[: named.size].assign(np.ascontiguousarray(named).ravel())
+        numbers = np.arange(named.size, dtype=np.int32).reshape(named.shape)
+        return cls.of_nodes(nodes, named.size, worlds * node_count), numbers
 
     def gather(self, f: wp.array, begin: int = 0, end: int | None = None, *, clears: bool = False) -> None:
         """Add each node's slots to its force.

@@ -18,7 +18,7 @@ from warp_corot.errors import InputError
 from warp_corot.kernels.elements.cpu import rest_matrices
 from warp_corot.kernels.elements.elements import ForestElements, GeneralElements, Subtrees
 from warp_corot.kernels.plan import batches as batch_kernels
-from warp_corot.kernels.plan import lists
+from warp_corot.kernels.plan import plan as lists
 from warp_corot.kernels.plan import slots as kernels
 from warp_corot.kernels.plan.plan import Plan, Tree, places_t
 from warp_corot.kernels.tables.shapes import MIRROR_BIT
@@ -43,7 +43,7 @@ def tree_of(forest: TetForest, elements: ForestElements, rotation_level: int | N
     tree.leaf_count, tree.node_count = counts[:1], counts[1:]
     tree.named = int(forest.node_count == len(forest.lattice))
     tree.leaf_tets = elements.nodes
-    tree.parent_code = device_frames(device).of_parents
+    tree.parent_code = device_frames(device)[1]
     if isinstance(source, UniformTree):
         tree.uniform = 1
         level = source.depth if rotation_level is None else min(rotation_level, source.depth)
@@ -356,29 +356,24 @@ def slots_of(
     Raises:
         InputError: There are more slots than can be numbered.
     """
-    device, plan = made.device, made.plan
-    begin, unused = [0], 0
+    device, plan, nodes = made.device, made.plan, made.batches.nodes
+    used = 4 * flat
     for row, count in enumerate(subtrees):
-        grouped = made.is_grouped(row)
-        begin.append(begin[-1] + (5 if grouped else 10) * count)
-        if grouped:
-            unused += count // 8 * (GROUP_NODES - len(group_nodes(made.kinds[row // plan.members][1])))
-    per_world = begin[-1] + 4 * flat
-    check_slots(worlds * per_world)
-    tables = places_on(device.alias)
-    targets = kernels.Targets()
-    targets.begin, targets.per_world, targets.no_node = _places(begin), per_world, plan.world_nodes
+        shape = made.kinds[row // plan.members][1]
+        used += count // 8 * len(group_nodes(shape)) if made.is_grouped(row) else 10 * count
+    total, node_count = len(nodes) + 4 * worlds * flat, worlds * plan.world_nodes
+    check_slots(total)
+    tables, targets = places_on(device.alias), kernels.Targets()
     targets.leaf_places, targets.group_leaf_places = tables.leaves, tables.group_leaves
     # The second half is room for sorting.
-    targets.nodes = wp.empty(2 * per_world, dtype=wp.int32, device=device)
-    targets.of_subtrees, targets.of_leaves = wp.empty_like(made.batches.nodes), wp.empty_like(elements.nodes)
-    threads = threads_on(device)
+    targets.nodes = wp.full(2 * total, node_count, dtype=wp.int32, device=device)
+    targets.of_subtrees, targets.of_leaves = wp.full_like(nodes, -1), wp.empty_like(elements.nodes)
     if any(subtrees):
-        inputs = [threads, plan, made.batches]
-        wp.launch(kernels.target_subtrees, (plan.classes, threads), inputs, [targets], device=device)
+        inputs = [threads_on(device), plan, made.batches]
+        wp.launch(kernels.target_subtrees, (plan.classes, threads_on(device)), inputs, [targets], device=device)
     if flat:
-        wp.launch(kernels.target_flat, (worlds, flat), [plan, made.tree], [targets], device=device)
-    slots = Slots.of_nodes(targets.nodes, per_world, per_world - unused, plan.world_nodes, worlds)
+        wp.launch(kernels.target_flat, worlds * flat, [len(nodes), plan, made.tree], [targets], device=device)
+    slots = Slots.of_nodes(targets.nodes, worlds * used, node_count)
     return slots, targets.of_subtrees, targets.of_leaves
 
 

@@ -46,7 +46,7 @@ class DividedForces:
         order = piece_of * count + node_of
         begins, places = (wp.array(each, dtype=wp.int32, device="cpu") for each in (starts, order))
         values = wp.zeros((len(pieces), count), dtype=wp.vec4, device="cpu")
-        self._values, self._slots = values, Slots(begins, places, values.flatten(), count * len(pieces))
+        self._values, self._slots = values, Slots(begins, places, values.flatten())
         self._regions = Regions(team, values.device)
 
     def add_forces(self, u: wp.array, f: wp.array) -> None:

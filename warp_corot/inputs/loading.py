@@ -22,7 +22,7 @@ from .stopwatch import KERNELS, WATCH
 SURFACES = ("meshing.domain", "meshing.windings")
 MESHING = ("meshing.domain", "meshing.elements", "meshing.embedding", "meshing.growth")
 #: Modules for bodies, for all steps, and for explicit ones whose length is chosen.
-BODY = ("plan.lists", "plan.batches", "stepping.team", "elements.cpu", "stepping.integrate")
+BODY = ("plan.plan", "plan.batches", "stepping.team", "elements.cpu", "stepping.integrate")
 STEPS = ("stepping.balance", "stepping.pace")
 STEPS_ON_CPU = ("subtrees.degenerate", *STEPS, "stepping.subnormals")
 EXPLICIT = ("stepping.stability",)

@@ -204,7 +204,7 @@ class ChangingMesh(Discretization):
         self.lame, self.mu, self.lam, self.material_stride = former.lame, former.mu, former.lam, former.material_stride
         self.activation, self.has_activation = former.activation, former.has_activation
         self.smallest_volume = former.smallest_volume
-        self._is_uniform = former.is_uniform
+        self.is_uniform, self.is_anisotropic = former.is_uniform, former.is_anisotropic
         self.kept: DevicePlan | None = None
         #: The host's data of the current mesh, by name.
         self._known: dict[str, Any] = {}
@@ -226,14 +226,6 @@ class ChangingMesh(Discretization):
         if "masses" not in self._known:
             self._known["masses"] = self._forest.carriage.arrays.mass[: self.sizes.nodes].numpy().copy()
         return self._known["masses"]
-
-    @property
-    def is_uniform(self) -> bool:
-        return self._is_uniform
-
-    @property
-    def is_anisotropic(self) -> bool:
-        return isinstance(self._carried.given, Directional)
 
     @property
     def prefers_subtrees(self) -> bool:

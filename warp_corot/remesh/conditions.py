@@ -162,72 +162,6 @@ def _alike(ones: Sequence[Followed], others: Sequence[Followed]) -> bool:
     )
 
 
-class CarriedActivation:
-    """Active stress that elements carry, passed between body and pools; bodies without active stress are left alone.
-
-    Args:
-        body: The body.
-        forest: Its pools.
-
-    Attributes:
-        keyframes: The keyframes that elements follow, or followed on the mesh that ``put_back`` restores.
-    """
-
-    def __init__(self, body: SoftBody, forest: DeviceForest):
-        self._body = body
-        self._forest = forest
-        self.keyframes = Keyframes()
-
-    def note(self, kept_rows: wp.array | None) -> None:
-        """Read the user's changes.
-
-        Args:
-            kept_rows: Rows that ``put_back`` may write, whose keyframes must be kept.
-        """
-        body, keyframes = self._body, self.keyframes
-        if not body.discretization.has_activation:
-            return
-        self._write(ACTIVATION, body.discretization.activation[: body.element_count])
-        if not keyframes.are(body.conditions.activations):
-            keyframes.forget(but=np.empty(0, np.int32) if kept_rows is None else kept_rows.numpy())
-            rows = keyframes.adopt(body.conditions.activations, body.element_count)
-            self._write(ACTIVATION_ROW, wp.array(rows, dtype=wp.int32, device=body.device))
-
-    def kept(self) -> dict[str, wp.array]:
-        """The data for ``put_back``, on the current mesh."""
-        if not self._body.discretization.has_activation:
-            return {}
-        return {name: self._read(name) for name in (ACTIVATION, ACTIVATION_ROW)}
-
-    def put_back(self, kept: dict[str, wp.array]) -> None:
-        """Write the data into the mesh from which they came; the pools hold that mesh already."""
-        for name in (ACTIVATION, ACTIVATION_ROW):
-            if name in kept:
-                self._write(name, kept[name])
-
-    def follow(self) -> None:
-        """Make the body's elements follow the keyframes of the rows that they carry."""
-        if self.keyframes.keys:
-            rows = self._read(ACTIVATION_ROW).numpy()
-            elements = np.flatnonzero(rows >= 0)
-            made = self.keyframes.make(elements, rows[elements], wp.float32, self._body.device)
-            if made is not self._body.conditions.activations:
-                self._body.conditions.set_activations(made)
-
-    def _write(self, name: str, given: wp.array) -> None:
-        wp.copy(self._of_leaves(name, len(given)), given)
-
-    def _read(self, name: str) -> wp.array:
-        return self._of_leaves(name, self._body.element_count).contiguous()
-
-    def _of_leaves(self, name: str, count: int) -> Any:
-        """What the first leaves carry by a name, in place."""
-        carriage, leaves = self._forest.carriage, self._forest.pools.leaves[:count]
-        if name in carriage.names:
-            return wp.indexedarray(carriage.arrays.values[:, carriage.names.index(name)], [leaves])
-        return wp.indexedarray(carriage.arrays.numbers[:, carriage.number_names.index(name)], [leaves])
-
-
 #: The arrays that ``put_back`` restores.
 KEPT: dict[str, Any] = {
     "held": wp.uint8,
@@ -248,7 +182,8 @@ class CarriedConditions:
 
     Attributes:
         keyframes: The keyframes that nodes follow.
-        activation: Active stress and the keyframes that it follows.
+        of_activation: Those that active stresses of elements follow, or followed on the mesh that ``put_back``
+            restores; bodies without active stress are left alone.
         kept: Held nodes, loads, rows, velocities and active stress as ``put_back`` writes them.
         found: The result of ``launch``, int32, for ``follow``.
     """
@@ -256,8 +191,7 @@ class CarriedConditions:
     def __init__(self, body: SoftBody, forest: DeviceForest):
         self._body = body
         self._forest = forest
-        self.keyframes = Keyframes()
-        self.activation = CarriedActivation(body, forest)
+        self.keyframes, self.of_activation = Keyframes(), Keyframes()
         self._revision = -1
         self._is_back = False
         self.kept: dict[str, wp.array] = {}
@@ -285,11 +219,12 @@ class CarriedConditions:
     def note(self) -> None:
         """Read the user's changes; call it before the mesh changes."""
         self._take_trajectories()
-        self.activation.note(self.kept.get(ACTIVATION_ROW))
+        self._take_activation()
         if self.of_present_mesh:
             arrays, count = self._forest.carriage.arrays, self._body.node_count
             self.kept = {name: wp.clone(getattr(arrays, name)[:count]) for name in ("held", "load", "row", "v")}
-            self.kept |= self.activation.kept()
+            if self._body.discretization.has_activation:
+                self.kept |= {name: self._of_leaves(name).contiguous() for name in (ACTIVATION, ACTIVATION_ROW)}
             self._kept_rows = None
 
     def put_back(self) -> None:
@@ -301,7 +236,9 @@ class CarriedConditions:
         velocities[held] = self.kept["v"].numpy()[held]
         arrays.v[:count].assign(velocities)
         arrays.reaction.zero_()
-        self.activation.put_back(self.kept)
+        for name in (ACTIVATION, ACTIVATION_ROW):
+            if name in self.kept:
+                wp.copy(self._of_leaves(name, len(self.kept[name])), self.kept[name])
         self._is_back = True
 
     def launch(self, goes: wp.array) -> None:
@@ -318,7 +255,7 @@ class CarriedConditions:
         Args:
             found: A copy of the attribute ``found``.
         """
-        self.activation.follow()
+        self.follow_activation()
         body = self._body
         # Nodes released later follow their former keyframes again on the restored mesh.
         if not (body.conditions.trajectories or self._is_back):
@@ -334,6 +271,15 @@ class CarriedConditions:
         if trajectories is not body.conditions.trajectories:
             body.conditions.set_trajectories(trajectories)
 
+    def follow_activation(self) -> None:
+        """Make the body's elements follow the keyframes of the rows that they carry."""
+        if self.of_activation.keys:
+            rows = self._of_leaves(ACTIVATION_ROW).contiguous().numpy()
+            elements = np.flatnonzero(rows >= 0)
+            made = self.of_activation.make(elements, rows[elements], wp.float32, self._body.device)
+            if made is not self._body.conditions.activations:
+                self._body.conditions.set_activations(made)
+
     def _settle(self) -> None:
         """Give rows to new nodes between nodes that follow different ones."""
         arrays = self._forest.carriage.arrays
@@ -343,6 +289,19 @@ class CarriedConditions:
         arrays.row[: len(rows)].assign(rows)
         everywhere = wp.ones(1, dtype=wp.int32, device=self._forest.device)
         self.launch(everywhere)
+
+    def _take_activation(self) -> None:
+        """Tell the device the active stress of elements, and which keyframes they follow, if the user has changed
+        them."""
+        body, keyframes = self._body, self.of_activation
+        if not body.discretization.has_activation:
+            return
+        wp.copy(self._of_leaves(ACTIVATION), body.discretization.activation[: body.element_count])
+        if not keyframes.are(body.conditions.activations):
+            kept = self.kept.get(ACTIVATION_ROW)
+            keyframes.forget(but=np.empty(0, np.int32) if kept is None else kept.numpy())
+            rows = keyframes.adopt(body.conditions.activations, body.element_count)
+            wp.copy(self._of_leaves(ACTIVATION_ROW), wp.array(rows, dtype=wp.int32, device=body.device))
 
     def _take_trajectories(self) -> None:
         """Tell the device which keyframes nodes follow, if the user has changed them."""
@@ -357,6 +316,14 @@ class CarriedConditions:
         if self._kept_rows is None:
             self._kept_rows = self.kept["row"].numpy() if "row" in self.kept else np.empty(0, np.int32)
         self.keyframes.forget(but=np.concatenate([self._kept_rows, rows]))
+
+    def _of_leaves(self, name: str, count: int | None = None) -> Any:
+        """What the leaves of the present mesh, or so many, carry by a name, in place."""
+        carriage, leaves = self._forest.carriage, self._forest.pools.leaves
+        leaves = leaves[: self._body.element_count if count is None else count]
+        if name in carriage.names:
+            return wp.indexedarray(carriage.arrays.values[:, carriage.names.index(name)], [leaves])
+        return wp.indexedarray(carriage.arrays.numbers[:, carriage.number_names.index(name)], [leaves])
 
     def _of_nodes(self, array: wp.array) -> npt.NDArray[Any]:
         return array[: self._body.node_count].numpy().copy()

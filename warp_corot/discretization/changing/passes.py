@@ -22,8 +22,8 @@ from warp_corot.inputs.checks import checked_number, shown
 from warp_corot.kernels.plan.changing import begin_counts
 from warp_corot.kernels.remesh import cut as cut_kernels
 from warp_corot.kernels.remesh import derived as kernels
-from warp_corot.kernels.remesh import order, refine, simplify
 from warp_corot.kernels.remesh import pools as pool_kernels
+from warp_corot.kernels.remesh import refine, simplify
 from warp_corot.kernels.remesh import split as split_kernels
 from warp_corot.kernels.remesh.criteria import PARAMETER_COUNTS, Contents, elongation, marking_kernel
 from warp_corot.kernels.remesh.cut_surface import Surface
@@ -170,7 +170,7 @@ class RemeshPass(_Launches):
         # Threads that add an edge at the same time may exceed the limit, but never fill the table.
         self._edges.most = size // 2
         self._removal = allocated(simplify.Removal, device, [(nodes, "willing head candidates")], head=-1)
-        self._moves = allocated(order.Moves, device, [(nodes, "holes movers forward"), (2, "counts")])
+        self._moves = allocated(simplify.Moves, device, [(nodes, "holes movers forward"), (2, "counts")])
         self._demand = wp.zeros(1, dtype=wp.int64, device=self.device)
         self._goes_on = wp.zeros(1, dtype=wp.int32, device=self.device)
         self._sums, self._ends = (wp.zeros(forest.threads, dtype=wp.int32, device=self.device) for _ in range(2))
@@ -196,14 +196,14 @@ class RemeshPass(_Launches):
         self._many(simplify.offer_nodes, self.levels[0], self._kept, carried, pools, removal)
         self._many(simplify.remove_nodes, pools, carried, removal)
         self._many(pool_kernels.settle_ends, pools, carried)
-        self._many(order.list_moves, pools, moves)
-        self._many(order.move_nodes, pools, carried, moves)
-        self._many(order.rename_nodes, moves, pools)
+        self._many(simplify.list_moves, pools, moves)
+        self._many(simplify.move_nodes, pools, carried, moves)
+        self._many(simplify.rename_nodes, moves, pools)
         self._many(pool_kernels.refresh_masses, pools, carried)
-        self._many(order.count_leaves, pools, self._sums)
+        self._many(simplify.count_leaves, pools, self._sums)
         wp.utils.array_scan(self._sums, self._ends, inclusive=True)
-        self._many(order.list_leaves, self._sums, self._ends, pools)
-        self._many(order.adopt_list, pools)
+        self._many(simplify.list_leaves, self._sums, self._ends, pools)
+        self._many(simplify.adopt_list, pools)
         self._many(refine.end_pass, pools, edges, moves.counts)
 
     # --- pieces ----------------------------------------------------------------------------------------------------
@@ -281,7 +281,7 @@ class CutPass(_Launches):
         surface = Surface()
         surface.stress = stress
         self._once(cut_kernels.begin_cut, 0, pools, cuts)
-        self._many(cut_kernels.list_all, pools, cuts)
+        self._many(cut_kernels.list_near, surface, carried, pools, cuts)
         self._many(cut_kernels.pull_faces, contents, carried, pools, cuts)
         self._many(cut_kernels.choose_faces, surface, pools, cuts)
         self._many(cut_kernels.tear_faces, pools, cuts)

@@ -235,7 +235,7 @@ def tree_of(forest: DeviceForest) -> Tree:
     tree.named = int(pools.node_limit == pools.sink)
     tree.leaf_tets, tree.leaves = pools.leaf_tets, pools.leaves
     tree.roots, tree.parent, tree.tets, tree.cut = pools.roots, pools.parent, pools.tets, pools.cut
-    tree.parent_code = device_frames(forest.device).of_parents
+    tree.parent_code = device_frames(forest.device)[1]
     # The frame of a root is along the axes: deformation gradients of padding are exact, energies zero.
     tree.sink, tree.padding_code = pools.sink, int(pools.code[:1].numpy()[0])
     return tree

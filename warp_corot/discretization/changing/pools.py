@@ -386,7 +386,7 @@ class DeviceForest:
         pools.first_child = self._filled(tree.first_child, self.tree_capacity, wp.int32, LIVE)
         codes = frames.codes(forest.lattice, tree.tets, tree.level)
         pools.code = self._filled(codes, self.tree_capacity, wp.int32)
-        pools.frames = device_frames(device).frames
+        pools.frames = device_frames(device)[0]
         pools.child_code = wp.array(frames.of_children, dtype=wp.int32, device=device)
         cut = np.zeros(0, np.int32) if tree.cut is None else tree.cut
         pools.cut = self._filled(cut, self.tree_capacity, wp.int32)

@@ -239,7 +239,7 @@ def pack_changing(changing: Changing) -> dict[str, Any]:
         "between": [[*ends, row] for ends, row in conditions.keyframes.between.items()],
         "loads": changing.body.conditions.has_loads,
         "activation": changing.body.discretization.has_activation,
-        "activation_rows": conditions.activation.keyframes.keys,
+        "activation_rows": conditions.of_activation.keys,
         "at_beginning": conditions.of_present_mesh,
         "survey": changing.survey.last,
     }
@@ -263,9 +263,8 @@ def unpack_changing(changing: Changing, packed: dict[str, Any]) -> None:
     if packed["activation"]:
         _ = body.activation  # made on first use
     changing.renew()
-    activation = changing.conditions.activation
-    activation.keyframes.keys = packed["activation_rows"]
-    activation.follow()
+    changing.conditions.of_activation.keys = packed["activation_rows"]
+    changing.conditions.follow_activation()
     rows = forest.carriage.arrays.row[: body.node_count].numpy()
     nodes = np.flatnonzero(rows >= 0).astype(np.int32)
     body.conditions.set_trajectories(keyframes.make(nodes, rows[nodes], wp.vec3, body.device))

@@ -16,7 +16,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from warp_corot.mesh.bisection import far_end
-from warp_corot.mesh.growing.refinement_criteria import FARTHER, GAP_ELEMENTS, ROUGH, surface_points
+from warp_corot.mesh.growing.refinement_criteria import FARTHER, GAP_ELEMENTS, ROUGH, THIN_NEED, surface_points
 from warp_corot.mesh.lattice import lattice_spacing, volume_shares
 from warp_corot.mesh.scattered import spread_over_eighths
 from warp_corot.mesh.topology import codes, connected, coordinates_in
@@ -300,6 +300,13 @@ class Resolved:
         return reversed(self._by_level)
 
 
+#: Where many elements need bisection alike, so that there are meshes of too few and of too many, the farther ones along
+#: the longest side need it more, by up to this share.
+FARTHER_FIRST = 0.05
+#: The drawn surface is closer to the body's than the mesh's threshold by this factor.
+FINER_SURFACE = 0.3
+
+
 class Coarsening:
     """The meshes in a forest, by the need of its tetrahedra to be bisected.
 
@@ -310,9 +317,16 @@ class Coarsening:
         resolved: The forest.
         needs: The need of each of its tetrahedra to be bisected [m], float32 [M].
         sliver: Leaves filled by less than this fraction are not counted.
+        least: The threshold up to which nothing is bisected [m].
+
+    Attributes:
+        resolved: The forest.
+        count, child, threshold: The number of counted leaves of the chosen mesh, the mesh, and its threshold.
     """
 
-    def __init__(self, resolved: Resolved, needs: np.ndarray, sliver: float):
+    def __init__(self, resolved: Resolved, needs: np.ndarray, sliver: float, least: float = 0.0):
+        self.resolved, self._needs, self._sliver, self._least = resolved, needs, sliver, least
+        self.count, self.child, self.threshold = 0, np.empty(0, np.int32), 0.0
         tree, holds = resolved.grown.tree, resolved.held > 0.0
         needs, of_node = needs.copy(), np.zeros(len(resolved.grown.lattice), np.float32)
         # Everything that can be asked for is in the forest: a conforming mesh of some of its tetrahedra needs no other
@@ -343,7 +357,7 @@ class Coarsening:
         self._counts -= len(begin) - np.searchsorted(begin, self._thresholds, side="right")
         self._counted = counted
 
-    def threshold(self, target: int, least: float) -> float:
+    def threshold_of(self, target: int, least: float) -> float:
         """The threshold, at least ``least``, with the largest number of elements up to a limit."""
         first = int(np.searchsorted(self._thresholds, np.float32(least), side="right"))
         if self.mesh(least)[0] <= target or first == len(self._thresholds):
@@ -359,6 +373,36 @@ class Coarsening:
         found = np.where(self._holds, np.where(self._own > limit, self._first_child, LIVE), VOID).astype(np.int32)
         found[self._above <= limit] = BELOW
         return int(np.count_nonzero(self._counted & (found == LIVE))), found
+
+    def choose(self, target: int) -> int:
+        """Choose the largest mesh with at most this many elements, or the coarsest; return its number of elements."""
+        self.threshold = self.threshold_of(target, self._least)
+        self.count, self.child = self.mesh(self.threshold)
+        return self.count
+
+    def told_apart(self, target: int) -> Coarsening:
+        """The meshes in the same forest if no two elements need bisection alike: more so the farther along the body's
+        longest side; the chosen one is the mesh of at most so many elements."""
+        grown = self.resolved.grown
+        along = grown.lattice[grown.tree.tets, int(np.argmax(grown.cells))].mean(axis=1)
+        needs = self.resolved.largest(self._needs * (1.0 + FARTHER_FIRST * along / along.max())).astype(np.float32)
+        found = Coarsening(self.resolved, needs, self._sliver, self._least)
+        found.choose(target)
+        return found
+
+    @property
+    def has_more(self) -> bool:
+        """Whether there are meshes with more elements than the chosen one."""
+        return self.threshold > self._least
+
+    def surface(self, threshold: float) -> np.ndarray:
+        """A mesh of the same forest, finer than that of a threshold, for the drawn surface."""
+        resolved, need = self.resolved, self.resolved.grown.need
+        # Thin parts that are flat need no finer surface.
+        curved = (resolved.held > 0.0) & ~np.isclose(need, THIN_NEED * resolved.lengths, rtol=1.0e-5)
+        needs = resolved.largest(np.where(curved, need, 0.0)).astype(np.float32)
+        needs = np.maximum(needs, np.where(self._needs > threshold, self._needs, 0.0))
+        return Coarsening(resolved, needs, self._sliver).mesh(FINER_SURFACE * threshold)[1]
 
 
 def points_within(

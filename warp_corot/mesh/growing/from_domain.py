@@ -41,19 +41,17 @@ NEAR, NEAR_ENOUGH = 0.985, 0.905
 MOST_CUBES = 4
 #: Along flat sides nothing is bisected; then more sizes are tried, which takes little time.
 MOST_CUBES_OF_BOXES = 7
-#: Where many elements need bisection alike, so that there are meshes of too few and of too many, the farther ones along
-#: the longest side need it more, by up to this share; a mesh with less than that share of the elements asked for gets
-#: other cubes first.
-FARTHER_FIRST, FEW = 0.05, 0.6
+#: A mesh with less than this share of the elements asked for gets other cubes before its elements are told apart.
+FEW = 0.6
 #: The assumed error of an element between such pieces, as a fraction of its edge.
 GAP_NEED = 0.5
 #: The thinner of two parts is bisected first: its need is larger by up to this fraction, by which a bisection shortens
 #: elements. Thicknesses are rounded to this many steps, so that equally thin parts stay equal. Without, plates of two
 #: layers are drawn with twice as many points, and their surfaces are farther off.
 THINNEST_FIRST, THIN_STEPS = 0.26, 16
-#: The drawn surface is closer to the body's than the mesh's threshold by this factor, for which the forest must be
-#: finer still; with many elements it is the mesh's own. Thin parts have no finer elements than the mesh may need.
-FINER_SURFACE, FINER_FOREST, FINER_THIN = 0.3, 0.2, 0.4
+#: The forest is finer by this factor than the mesh's threshold, for the drawn surface; with many elements this is the
+#: mesh's own. Thin parts have no finer elements than the mesh may need.
+FINER_FOREST, FINER_THIN = 0.2, 0.4
 #: The size of cubes gives this fraction of the elements when none is bisected: about six in a cube inside, four at the
 #: surface. With more elements the surface needs a smaller fraction, so the fraction rises between two numbers of
 #: elements.
@@ -99,63 +97,12 @@ class Budget:
     wishes: Wishes
 
 
-class Meshes:
-    """The meshes in one forest, ordered by number of elements.
-
-    Attributes:
-        resolved: The forest.
-        count: Number of elements of the present mesh that contain enough of the body.
-        child: The present mesh, see `Coarsening`.
-    """
-
-    def __init__(self, resolved: Resolved, needs: np.ndarray, least: float, sliver: float):
-        self.resolved = resolved
-        self._needs, self._least, self._sliver = needs, least, sliver
-        self._coarsening = Coarsening(resolved, needs, sliver)
-        self.count, self.threshold = 0, 0.0
-        self.child = np.empty(0, np.int32)
-
-    def choose(self, target: int) -> int:
-        """Make the present mesh the largest one with at most this many elements, or the coarsest; return its number of
-        elements.
-        """
-        self.threshold = self._coarsening.threshold(target, self._least)
-        self.count, self.child = self._coarsening.mesh(self.threshold)
-        return self.count
-
-    def told_apart(self, target: int) -> Meshes:
-        """The meshes in the same forest if no two elements need bisection alike: more so the farther along the body's
-        longest side; the present one is the mesh of at most so many elements."""
-        grown = self.resolved.grown
-        axis = int(np.argmax(grown.cells))
-        along = grown.lattice[grown.tree.tets, axis].mean(axis=1)
-        needs = self._needs * (1.0 + FARTHER_FIRST * along / along.max())
-        needs = self.resolved.largest(needs).astype(np.float32)
-        found = Meshes(self.resolved, needs, self._least, self._sliver)
-        found.choose(target)
-        return found
-
-    @property
-    def has_more(self) -> bool:
-        """Whether there are meshes with more elements than the present one."""
-        return self.threshold > self._least
-
-    def surface(self, threshold: float) -> np.ndarray:
-        """A mesh of the same forest, finer than that of a threshold, for the drawn surface; in the form of `child`."""
-        resolved, need = self.resolved, self.resolved.grown.need
-        # Thin parts that are flat need no finer surface.
-        curved = (resolved.held > 0.0) & ~np.isclose(need, THIN_NEED * resolved.lengths, rtol=1.0e-5)
-        needs = resolved.largest(np.where(curved, need, 0.0)).astype(np.float32)
-        needs = np.maximum(needs, np.where(self._needs > threshold, self._needs, 0.0))
-        return Coarsening(resolved, needs, self._sliver).mesh(FINER_SURFACE * threshold)[1]
-
-
-def chosen_meshes(domain: Domain, budget: Budget, sliver: float, device: wp.Device) -> Meshes | None:
+def chosen_meshes(domain: Domain, budget: Budget, sliver: float, device: wp.Device) -> Coarsening | None:
     """The forest that contains a mesh with nearly the allowed number of elements, and this mesh.
 
     None if the coarsest has more.
     """
-    best: Meshes | None = None
+    best: Coarsening | None = None
     largest = 1.001 * float(np.ptp(domain.bounds, axis=0).max())
     suits = min(predicted_cell_size(domain, budget.target), largest)
     size = budget.cell_size or suits
@@ -183,7 +130,7 @@ def chosen_meshes(domain: Domain, budget: Budget, sliver: float, device: wp.Devi
 
 def predicted_cell_size(domain: Domain, target: int) -> float:
     """The edge [m] of cubes that fill a body with about this number of elements."""
-    from warp_corot.domain.reference import extent_of
+    from warp_corot.domain.fidelity import extent_of
 
     volume, area = extent_of(domain)
     way = float(np.clip(np.log(target / FEWER) / np.log(MORE / FEWER), 0.0, 1.0))
@@ -207,7 +154,7 @@ def _of_cubes(
     suits: float,
     sliver: float,
     device: wp.Device,
-) -> Meshes:
+) -> Coarsening:
     """The meshes of one size of cubes, with the largest allowed one chosen; if cubes are larger than the number needs,
     they have this many more levels.
     """
@@ -236,7 +183,7 @@ def _of_cubes(
     resolved = Resolved(growing.grown(), size, domain)
     needs = needs_of(resolved, domain, budget.min_layers, most, deepest)
     needs = resolved.largest(np.maximum(needs, floor_needs(resolved, points, largest, deepest))).astype(np.float32)
-    found = Meshes(resolved, needs, budget.wishes.surface_error, sliver)
+    found = Coarsening(resolved, needs, sliver, budget.wishes.surface_error)
     found.choose(int(NEAR * target))
     return found
 
