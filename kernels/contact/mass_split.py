@@ -452,7 +452,7 @@ def solver(has_triangles: bool, has_pairs: bool, on_cpu: bool) -> wp.Kernel:
     ):
         """Correct the force of the k-th contact that may act; between iterations it is in a record, if there is one."""
         contact = Contact()
-        if phase == LOCATE + 1 or k >= records.shape[0]:  # noqa: SIM108 (Warp has no such expression of structs)
+        if phase == LOCATE + 1 or k >= records.shape[0]:
             contact = contact_of(sums.live[k], dt, all)
         else:
             contact = records[k]

@@ -6,6 +6,8 @@ force at that place (Boussinesq, Cerruti), which is right far away for any distr
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import numpy.typing as npt
 
@@ -208,7 +210,7 @@ def hertz_cylinder(setup: Setup) -> list[Row]:
     roller = Tool(Capsule(radius, 0.1, quaternion=along_y))
     roller.follow([0.0, 0.1], [(0.0, 0.5 * side, radius), (0.0, 0.5 * side, radius - depth)])
     integrator, contact = BackwardEuler(dt=0.02), Contact(friction=0.0)
-    things = [roller, *smooth_walls(side)]
+    things: list[Any] = [roller, *smooth_walls(side)]
     sim = Simulation(body, obstacles=things, gravity=NONE, integrator=integrator, contact=contact)
     sim.advance_steps(12)
     setup.shown = [body], [roller]
