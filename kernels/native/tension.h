@@ -71,8 +71,11 @@ template <class M43, class M> COROT_INLINE M43 twist_at(const M& strain, float m
     const float e[6] = {strain.data[0][0], strain.data[1][1], strain.data[2][2], strain.data[0][1], strain.data[0][2],
         strain.data[1][2]};
     const Twist<float> t = twist_of(e, mu, lam, pressure);
-    const float* s = t.theta;
-    return M43(s[0], s[3], s[4], s[3], s[1], s[5], s[4], s[5], s[2], t.pulling, t.largest, 0.0f);
+    const int places[9] = {0, 3, 4, 3, 1, 5, 4, 5, 2};
+    M43 found;
+    for (int i = 0; i < 9; ++i) found.data[i / 3][i % 3] = t.theta[places[i]];
+    found.data[3][0] = t.pulling, found.data[3][1] = t.largest, found.data[3][2] = 0.0f;
+    return found;
 }
 
 #if !defined(__CUDACC__)
