@@ -3,15 +3,13 @@
 import numpy as np
 import oracle
 import pytest
-from cases import CUBE, MESHES, edge_scale, mixed_forest, oracle_mesh, random_displacement
-from fibres import made, muscle, random_axes, wood, wood_tensor
-from remesh_cases import apply_marks, random_marks
+from cases import MESHES, mixed_forest, oracle_mesh, random_displacement
+from fibres import made, random_axes, wood, wood_tensor
 from tangents import (
     assert_diagonal,
     assert_equal,
     assert_keeps_translations,
     assert_symmetric,
-    diagonal,
     difference,
     product,
 )
@@ -108,17 +106,6 @@ def test_elements_where_the_law_goes_over_to_the_isotropic_one(device, rng):
 
 
 @pytest.mark.parametrize("case", SHORTENED_ENDS)
-def test_every_state_is_finite(case, device, rng):
-    mesh = MESHES[case]()
-    field, _ = bound(mesh, made("wood field", mesh, rng)[0], device)
-    p = random_displacement(mesh, rng, 1.0)
-    flat = (-mesh.points * [0, 0, 1]).astype(np.float32)
-    for u in (0 * flat, flat, (-mesh.points).astype(np.float32), (-2 * mesh.points).astype(np.float32), 1e3 * flat):
-        assert np.isfinite(product(field, u, p)).all()
-        assert np.isfinite(diagonal(field, u)).all()
-
-
-@pytest.mark.parametrize("case", SHORTENED_ENDS)
 def test_active_stress(case, device, rng):
     """s (F d) d^T is linear in F: its part of K is exact and uses the current stress."""
     mesh = MESHES[case]()
@@ -156,25 +143,3 @@ def test_other_rotations_give_the_same(device, rng):
     u, p = turned(mesh, rng, 0.1), random_displacement(mesh, rng, 1.0)
     products = [product(bound(mesh, material, device, each)[0], u, p) for each in (wc.Corotated(rotation="svd"), None)]
     assert_equal(*products)
-
-
-def test_a_mesh_that_has_changed(device, rng):
-    """The result equals that of a mesh made that way, with fibres and their stress carried over."""
-    forest = wc.TetForest.box((2, 1, 1), CUBE, 6)
-    forest = forest.refine(rng.choice(len(forest.tets), 5, replace=False))
-    body = wc.SoftBody(forest, muscle(rng.standard_normal((len(forest.tets), 3))), device=device)
-    body.activate(rng.uniform(-1e3, 1e3, len(forest.tets)))
-    options = wc.OnlineRemesh(capacity=4 * len(forest.tets), min_level=0, max_level=48)
-    sim = wc.Simulation(body, remesh=options)
-    changing, field = sim.remeshing.changing[0], sim.fields[0]
-    for _ in range(2):
-        apply_marks(changing.passes, random_marks(changing.forest, rng, 0.05, 0.2))
-        changing.renew()
-        mesh, count, places = changing.forest.to_forest(), body.node_count, len(body.node_displacements)
-        other, alone = bound(mesh, body.material, device)
-        alone.activate(body.activation.numpy())
-        u, p = 0.1 * edge_scale(mesh) * rng.uniform(-1, 1, (count, 3)), rng.standard_normal((count, 3))
-        found = product(field, u, p, places=places)
-        assert_equal(found[:count], product(other, u, p))
-        assert not found[count:].any()
-        assert_equal(diagonal(field, u, places=places)[:count], diagonal(other, u))

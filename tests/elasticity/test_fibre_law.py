@@ -3,15 +3,11 @@
 import numpy as np
 import oracle
 import pytest
-import warp as wp
 from cases import jittered, mixed_forest, oracle_mesh, random_displacement
 from fibres import random_axes
 from tangents import assert_diagonal, assert_equal, assert_symmetric, difference, product
 
 import warp_corot as wc
-from warp_corot.kernels.corotated.anisotropic import REINFORCED, ReinforcedMaterial
-from warp_corot.kernels.elements.forces import scatter_forces
-from warp_corot.kernels.elements.simd8 import LANES
 
 MATRIX = {"young": 500.0, "poisson": 0.4, "density": 10.0}
 MU, LAM = oracle.lame(MATRIX["young"], MATRIX["poisson"])
@@ -203,29 +199,3 @@ def test_active_fibres_shorten_a_beam_at_rest(poisson, device):
     end = mesh.points[:, 2] > mesh.points[:, 2].max() - 1e-9
     assert body.displacements.numpy()[end, 2].max() < -0.001
     assert np.abs(body.displacements.numpy()[end, 2]).max() < 0.03
-
-
-@pytest.mark.parametrize("is_general", [False, True])
-@pytest.mark.parametrize("amount", [1e-4, 0.1, 1.0])
-def test_elements_side_by_side_do_what_each_does_alone(is_general, amount, rng):
-    """Of all types, each with its own material, axes, angle and active stress, until some are turned inside out."""
-    forest = mixed_forest()
-    mesh = wc.TetMesh(forest.points, forest.tets) if is_general else forest
-    count = len(mesh.tets)
-    assert count % LANES
-    numbers = {
-        "young": rng.uniform(100, 900, count),
-        "k1": rng.uniform(100, 400, count),
-        "k2": np.where(rng.uniform(size=count) < 0.1, 1e-8, rng.uniform(0.5, 50, count)),
-        "kappa": rng.uniform(0, 0.3, count),
-        "angle": np.where(rng.uniform(size=count) < 0.3, 0.0, rng.uniform(0, np.pi / 2, count)),
-    }
-    body = wc.SoftBody(mesh, tissue(random_axes(rng, count), **numbers), device="cpu")
-    body.activation.assign(rng.uniform(0, 300, count).astype(np.float32))
-    body.displacements = random_displacement(mesh, rng, amount)
-    field, u = MODEL.bind(body), body.state.displacements
-    expected, found = (wp.zeros_like(body.state.forces) for _ in range(2))
-    alone = scatter_forces(body.discretization.element_kind, ReinforcedMaterial, REINFORCED.stress)
-    wp.launch(alone, count, [field.elements, field.material, u], [expected], device="cpu")
-    field.add_forces(u, found)
-    np.testing.assert_allclose(found.numpy(), expected.numpy(), rtol=0, atol=1e-5 * np.abs(expected.numpy()).max())

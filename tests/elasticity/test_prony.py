@@ -10,9 +10,6 @@ from tangents import assert_diagonal, assert_symmetric, on_device, product
 
 import warp_corot as wc
 from warp_corot.elasticity.float64 import displacement_gradients, green_strain
-from warp_corot.kernels.elements import added as prony
-from warp_corot.kernels.elements.forces import element_law, scatter_forces
-from warp_corot.kernels.elements.simd8 import LANES, PRONY
 
 MATERIAL = {"young": 500.0, "poisson": 0.3, "density": 10.0}
 MU, LAM = oracle.lame(MATERIAL["young"], MATERIAL["poisson"])
@@ -205,32 +202,3 @@ def test_elements_carry_their_history_where_the_mesh_changes(device, tmp_path):
     print(tips)
     # Elements that lost their history would resist as if they had never moved.
     assert tips["coarse"][1] > tips["remeshed"][1] > tips["fine"][1]
-
-
-@pytest.mark.parametrize("is_general", [False, pytest.param(True, marks=pytest.mark.slow)])
-def test_elements_side_by_side_do_what_each_does_alone(is_general, rng):
-    """Forces and relaxation of elements of all types, each with its own material and history."""
-    forest = mixed_forest()
-    mesh = wc.TetMesh(forest.points, forest.tets) if is_general else forest
-    count = len(mesh.tets)
-    assert count % LANES
-    body = wc.SoftBody(mesh, wc.Isotropic(rng.uniform(1e4, 1e5, count), 0.3, 1000.0), device="cpu")
-    field = wc.Prony(G, TAU, LAW).bind(body)
-    state, kind = body.state, body.discretization.element_kind
-    material = field.material
-    material.known.assign(rng.normal(scale=0.1, size=len(material.known)).astype(np.float32))
-    material.elapsed.fill_(0.01)
-    body.displacements = random_displacement(mesh, rng, 0.3)
-    expected, found = (wp.zeros_like(state.forces) for _ in range(2))
-    alone = scatter_forces(kind, prony.PronyMaterial, element_law(PRONY.code, prony.PronyMaterial).stress)
-    wp.launch(alone, count, [field.elements, material, state.displacements], [expected], device="cpu")
-    field.add_own_forces(state.displacements, found)
-    np.testing.assert_allclose(found.numpy(), expected.numpy(), rtol=0, atol=1e-5 * np.abs(expected.numpy()).max())
-
-    pace = wc.Simulation(body, integrator=wc.SymplecticEuler(dt=0.01)).pace.arrays
-    before = material.known.numpy()
-    wp.launch(prony.relax(kind), count, [field.elements, state.displacements, pace, material], [], device="cpu")
-    after = material.known.numpy()
-    material.known.assign(before)
-    field.complete_step(state.displacements, pace)
-    np.testing.assert_allclose(material.known.numpy(), after, rtol=0, atol=1e-5 * np.abs(after).max())

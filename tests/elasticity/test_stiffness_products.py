@@ -8,6 +8,7 @@ import oracle
 import pytest
 import warp as wp
 from cases import MATERIAL, MESHES, MODELS, edge_scale, jittered, mixed_forest, oracle_mesh, random_displacement
+from fibres import made, muscle
 from remesh_cases import CUBE, apply_marks, random_marks
 from shortened import crossed
 from tangents import (
@@ -145,31 +146,60 @@ def test_products_are_added_and_need_no_slots(model, device, rng):
     assert_equal(blocks.numpy(), 2 * block)
 
 
+FINITE = {
+    "the paper's": ("level 3", {"exact": False}),
+    "exact": ("level 3", {"exact": True}),
+    "the paper's, general": ("general", {"exact": False}),
+    "exact, general": ("general", {"exact": True}),
+    "wood": ("level 3", {}),
+    "wood, general": pytest.param("general", {}, marks=pytest.mark.slow),
+}
+
+
+@pytest.mark.parametrize(("case", "options"), FINITE.values(), ids=FINITE)
+def test_every_state_is_finite(case, options, device, rng):
+    """At rest, flat, a point, a point reflection, inverted and stretched a thousandfold."""
+    mesh = MESHES[case]()
+    material = wc.Isotropic(**MATERIAL) if options else made("wood field", mesh, rng)[0]
+    field = wc.Corotated(dilatation="element").bind(wc.SoftBody(mesh, material, device=device))
+    p = random_displacement(mesh, rng, 1.0)
+    flat = (-mesh.points * [0, 0, 1]).astype(np.float32)
+    for u in (0 * flat, flat, (-mesh.points).astype(np.float32), (-2 * mesh.points).astype(np.float32), 1e3 * flat):
+        assert np.isfinite(product(field, u, p, **options)).all()
+        assert np.isfinite(diagonal(field, u, **options)).all()
+
+
 REMESHED = {
     "corotated": wc.Corotated(),
     "level": wc.Corotated(rotation_level=4),
     "tolerance": wc.Corotated(rotation_level=0.1),
     "neo-hookean": wc.NeoHookean(),
     "edge springs": wc.EdgeStVK(),
+    "active muscle": wc.Corotated(),
 }
 
 
-@pytest.mark.parametrize("model", REMESHED)
-def test_a_mesh_that_has_changed(model, device, rng):
+@pytest.mark.parametrize("name", REMESHED)
+def test_a_mesh_that_has_changed(name, device, rng):
     """The product equals that on a mesh made that way, with varying material; padding gets nothing."""
     forest = wc.TetForest.box((2, 1, 1), CUBE, 6)
     forest = forest.refine(rng.choice(len(forest.tets), 5, replace=False))
-    material = {"poisson": 0.4, "density": 1000.0}
-    young = rng.uniform(1e4, 3e4, len(forest.tets))
-    body = wc.SoftBody(forest, wc.Isotropic(young=young, **material), device=device)
-    options = wc.OnlineRemesh(capacity=4 * len(forest.tets), min_level=0, max_level=48)
-    sim = wc.Simulation(body, model=REMESHED[model], remesh=options)
+    count, is_muscle = len(forest.tets), "muscle" in name
+    material = muscle(rng.standard_normal((count, 3))) if is_muscle else None
+    body = wc.SoftBody(forest, material or wc.Isotropic(rng.uniform(1e4, 3e4, count), 0.4, 1000.0), device=device)
+    if is_muscle:
+        body.activate(rng.uniform(-1e3, 1e3, count))
+    options = wc.OnlineRemesh(capacity=4 * count, min_level=0, max_level=48)
+    sim = wc.Simulation(body, model=REMESHED[name], remesh=options)
     changing, field = sim.remeshing.changing[0], sim.fields[0]
     for _ in range(2):
         apply_marks(changing.passes, random_marks(changing.forest, rng, 0.05, 0.2))
         changing.renew()
         mesh, count, places = changing.forest.to_forest(), body.node_count, len(body.node_displacements)
-        alone = REMESHED[model].bind(wc.SoftBody(mesh, body.material, device=device))
+        other = wc.SoftBody(mesh, body.material, device=device)
+        if is_muscle:
+            other.activate(body.activation.numpy())
+        alone = REMESHED[name].bind(other)
         # Small enough that some subtrees share rotations within the tolerance.
         u, p = 0.05 * edge_scale(mesh) * rng.uniform(-1, 1, (count, 3)), rng.standard_normal((count, 3))
         found, reference = product(field, u, p, places=places), product(alone, u, p)

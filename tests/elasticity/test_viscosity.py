@@ -2,13 +2,9 @@
 
 import numpy as np
 import pytest
-import warp as wp
 
 import warp_corot as wc
 from warp_corot.elasticity.added_stress import Viscosity
-from warp_corot.kernels.elements.added import ViscousMaterial, viscosity_stress
-from warp_corot.kernels.elements.forces import scatter_forces
-from warp_corot.kernels.elements.simd8 import LANES
 
 BOX = wc.TetForest.box((1, 1, 2), 0.1, 3)
 GENERAL = wc.TetMesh(BOX.points, BOX.tets)
@@ -172,29 +168,3 @@ def test_the_first_mode_of_a_beam_decays_as_rayleigh_says(case, device):
 def test_viscosity_must_be_a_time(value):
     with pytest.raises(wc.InputError, match="viscosity is"):
         wc.SymplecticEuler(viscosity=value)
-
-
-MIXED = wc.TetForest.box((1, 1, 2), 0.1, 4).refine(np.arange(0, 100, 7))
-
-
-@pytest.mark.parametrize("is_general", [False, pytest.param(True, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("amount", [0.0, 0.05, 3.0])
-def test_elements_side_by_side_do_what_each_does_alone(is_general, amount, rng):
-    """Of all types, each with its own material, strained until some are turned inside out."""
-    mesh = wc.TetMesh(MIXED.points, MIXED.tets) if is_general else MIXED
-    count = len(mesh.tets)
-    assert count % LANES
-    body = wc.SoftBody(mesh, wc.Isotropic(rng.uniform(1e4, 1e5, count), 0.3, 1000.0), device="cpu")
-    body.displacements, body.velocities = strained(mesh, rng, amount), rng.normal(size=mesh.points.shape)
-    field = wc.Corotated().bind(body)
-    Viscosity(body, field, 0.1).add_forces()
-    expected, state = wp.zeros_like(body.state.forces), body.state
-    material = ViscousMaterial()
-    material.isotropic, material.seconds, material.velocities = field.isotropic, 0.1, state.velocities
-    inputs = [field.elements, material, state.displacements]
-    alone = scatter_forces(body.discretization.element_kind, ViscousMaterial, viscosity_stress)
-    wp.launch(alone, count, inputs, [expected], device="cpu")
-    atol = 2e-5 * np.abs(expected.numpy()).max()
-    np.testing.assert_allclose(state.forces.numpy(), expected.numpy(), rtol=0, atol=atol)
-    rest, now = (np.linalg.det(np.diff(x[mesh.tets], axis=1)) for x in (mesh.points, body.positions.numpy()))
-    assert (now / rest < 0.0).any() == (amount > 1.0)
