@@ -122,7 +122,7 @@ class Adjoint:
         x = wp.zeros(len(right), dtype=wp.vec4, device=device)
         solution, left = np.zeros_like(right), self._free(right)
         wanted = np.linalg.norm(right.reshape(worlds, -1), axis=1)
-        best = np.inf
+        self.residual = np.inf
         for number in range(REFINEMENTS):
             self._solver.begin(wp.array(padded(left), dtype=wp.vec4, device=device), x)
             self._solver.iterate(self._precondition, x)
@@ -135,19 +135,18 @@ class Adjoint:
                 )
             self.iterations += int(report.iterations.max())
             trial = solution + x.numpy()[:, :3]
-            rest = wp.array(padded(trial), dtype=wp.vec4, device=device)
-            product = self._product(rest) + self._share * self._masses * trial
-            left = self._free(np.where(self._held, 0.0, right - product))
+            product = self._product(wp.array(padded(trial), dtype=wp.vec4, device=device))
+            left = right - product - self._share * self._masses * trial
+            left = self._free(np.where(self._held, 0.0, left))
             norms = np.linalg.norm(left.reshape(worlds, -1), axis=1)
             residual = float((norms / np.where(wanted > 0.0, wanted, 1.0)).max())
-            if not residual < best:
+            if not residual < self.residual:
                 break
-            solution, best = trial, residual
+            solution, self.residual = trial, residual
             if residual < self._tolerance:
                 break
-        self.residual = best
-        if best > LARGEST_RESIDUAL:
-            raise ConvergenceError(f"the adjoint solve did not converge: its residual is {best:.2g}")
+        if self.residual > LARGEST_RESIDUAL:
+            raise ConvergenceError(f"the adjoint solve did not converge: its residual is {self.residual:.2g}")
         return solution
 
     def _free(self, x: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:

@@ -89,7 +89,7 @@ class RestingContact:
         self.columns: list[Column] = []
         for row, sticks in zip(rows, sticking(rows, friction), strict=True):
             nodes, weights = self._borne(row)
-            directions = np.eye(3) if sticks else unit_normal(row)[None]
+            directions = np.eye(3) if sticks else row.normal[None] / np.linalg.norm(row.normal)
             self.columns += [Column(row, each, not sticks, nodes, weights) for each in directions]
         if len(self.columns) > MOST_ROWS:
             raise InputError(f"contact has {len(self.columns)} unknowns; gradients take up to {MOST_ROWS}")
@@ -370,11 +370,6 @@ def _pair_gap(row: ActingRow, x: npt.NDArray[np.complexfloating]) -> npt.NDArray
     return sign * np.sum(normal * (x[..., 0, :] - x[..., corner, :]), axis=-1) / np.sqrt(np.sum(normal**2, axis=-1))
 
 
-def unit_normal(row: ActingRow) -> Array:
-    """A contact's normal, [3]."""
-    return np.asarray(row.normal / np.linalg.norm(row.normal))
-
-
 def sticking(rows: Sequence[ActingRow], friction: Sequence[float]) -> list[bool]:
     """Whether friction holds each contact.
 
@@ -387,7 +382,8 @@ def sticking(rows: Sequence[ActingRow], friction: Sequence[float]) -> list[bool]
     """
     sticks, slipping = [], 0
     for row in rows:
-        normal, bound = unit_normal(row), 0.0 if row.obstacle < 0 else friction[row.obstacle]
+        normal = row.normal / np.linalg.norm(row.normal)
+        bound = 0.0 if row.obstacle < 0 else friction[row.obstacle]
         push = float(row.force @ normal)
         across = float(np.linalg.norm(row.force - push * normal))
         sticks.append(bound > 0.0)

@@ -79,19 +79,25 @@ def with_values(body: SoftBody, values: Values) -> SoftBody:
     Raises:
         InputError: A value cannot be used, or the rest shape of a mesh with cut elements is replaced.
     """
-    moduli = {name: given(values[name]) for name in ("young", "poisson", "density") if name in values}
+    count, nodes = body.sizes.nodes, np.arange(body.world_node_count)
+
+    def nodal(name: str) -> npt.NDArray[np.float64]:
+        array = np.asarray(values[name], np.float64)
+        if array.shape != (count, 3):
+            raise InputError(f"{name} has shape {array.shape}; it must be [{count}, 3]")
+        return array
+
+    arrays = {name: np.asarray(values[name], np.float64) for name in ("young", "poisson", "density") if name in values}
+    moduli: dict[str, Any] = {name: array if array.ndim else float(array) for name, array in arrays.items()}
     material = replace(body.material, **moduli) if moduli else body.material
-    copy = SoftBody(
-        _mesh(body, values.get("rest")), material, worlds=body.worlds, device=body.device, threads=body.threads
-    )
-    conditions, count = copy.conditions, body.sizes.nodes
+    mesh = _mesh(body, values.get("rest"))
+    copy = SoftBody(mesh, material, worlds=body.worlds, device=body.device, threads=body.threads)
+    conditions = copy.conditions
     wp.copy(conditions.held, body.conditions.held, count=count)
     conditions.find_inverse_masses()
-    if "loads" in values:
-        copy.load(np.arange(body.world_node_count), _nodal(body, values["loads"], "loads").reshape(body.worlds, -1, 3))
-    elif body.conditions.has_loads:
-        loads = body.conditions.loads.numpy()[:count, :3].reshape(body.worlds, -1, 3)
-        copy.load(np.arange(body.world_node_count), loads)
+    if "loads" in values or body.conditions.has_loads:
+        loads = nodal("loads") if "loads" in values else body.conditions.loads.numpy()[:count, :3]
+        copy.load(nodes, loads.reshape(body.worlds, -1, 3))
     if "activation" in values:
         copy.activate(np.asarray(values["activation"], np.float64))
     elif body.discretization.has_activation:
@@ -101,17 +107,9 @@ def with_values(body: SoftBody, values: Values) -> SoftBody:
     displacements = body.state.displacements.numpy()[:count, :3].astype(np.float64)
     if "boundary" in values:
         held = body.conditions.held_mask()[:, None]
-        displacements = np.where(
-            held, _nodal(body, values["boundary"], "boundary") - copy.rest_positions, displacements
-        )
+        displacements = np.where(held, nodal("boundary") - copy.rest_positions, displacements)
     copy.state.set_displacements(displacements)
     return copy
-
-
-def given(values: npt.ArrayLike) -> float | npt.NDArray[np.float64]:
-    """A material's value: float64, a number if it has no dimensions."""
-    array = np.asarray(values, np.float64)
-    return array if array.ndim else float(array)
 
 
 def _mesh(body: SoftBody, rest: npt.ArrayLike | None) -> Any:
@@ -124,10 +122,3 @@ def _mesh(body: SoftBody, rest: npt.ArrayLike | None) -> Any:
     if points.shape != mesh.points.shape:
         raise InputError(f"rest has shape {points.shape}; it must be [{len(mesh.points)}, 3]")
     return TetMesh(points, mesh.tets, up_axis=mesh.up_axis)
-
-
-def _nodal(body: SoftBody, values: npt.ArrayLike, name: str) -> npt.NDArray[np.float64]:
-    array = np.asarray(values, np.float64)
-    if array.shape != (body.sizes.nodes, 3):
-        raise InputError(f"{name} has shape {array.shape}; it must be [{body.sizes.nodes}, 3]")
-    return array

@@ -43,7 +43,8 @@ class ElementWork:
         law = (self._shared.shear if self._shared else field).stress_law
         missing = names if law is None else {"rest"} & names if law.sees_shape else set()
         if missing:
-            said = _listed(missing)
+            words = {"lame": "moduli", "rest": "the rest shape", "activation": "active stress"}
+            said = " and ".join(words[name] for name in sorted(missing))
             raise InputError(f"the model's forces have no derivative with respect to {said}; leave it out of wrt")
         if "lame" in names and law is not None and law.Material is not IsotropicMaterial:
             raise InputError("the material is anisotropic; derivatives with respect to its moduli do not exist yet")
@@ -119,11 +120,6 @@ class ElementWork:
         wp.launch(kernel, self.field.element_count, given, device=self.device)
 
 
-def _listed(names: set[str]) -> str:
-    words = {"lame": "moduli", "rest": "the rest shape", "activation": "active stress"}
-    return " and ".join(words[name] for name in sorted(names))
-
-
 Array = npt.NDArray[np.float64]
 
 
@@ -166,22 +162,27 @@ class StepSums:
         self.of_loads.zero_()
         self._of_mass.zero_()
 
-    def derivatives(self) -> dict[str, Any]:
+    def derivatives(self, **places: Any) -> dict[str, Any]:
         """The derivatives with respect to everything but the initial state; "rest" lacks the part of that state."""
         count = self.body.sizes.nodes
         moved = self.of_loads.numpy()[:count, :3].astype(np.float64)
-        return derivatives(self.body, self.work, self.names, moved, self._of_mass.numpy()[:count])
+        return derivatives(self.body, self.work, self.names, moved, self._of_mass.numpy()[:count], **places)
 
 
-def derivatives(body: SoftBody, work: Any, names: Sequence[str], moved: Array, of_mass: Array) -> dict[str, Any]:
+def derivatives(
+    body: SoftBody, work: Any, names: Sequence[str], moved: Array, of_mass: Array, *, boundary: Any = 0.0, **places: Any
+) -> dict[str, Any]:
     """Derivatives of these names from sums.
 
     Args:
         body: The body.
         work: The sums of elements, an ``ElementWork`` or what has the same results.
-        names: Any except "boundary" and those of an initial state; "rest" is the derivative at constant positions.
+        names: Any except those of an initial state.
         moved: The sum of adjoint motions, [worlds * N, 3].
         of_mass: The derivative with respect to the mass of each node, [worlds * N].
+        boundary: The derivative with respect to the places of held nodes, [worlds * N, 3]; they keep their
+            displacements, so their places follow the rest shape.
+        places: Other derivatives with respect to places.
     """
     found: dict[str, Callable[[], Any]] = {
         "loads": lambda: moved,
@@ -190,9 +191,12 @@ def derivatives(body: SoftBody, work: Any, names: Sequence[str], moved: Array, o
         "poisson": lambda: of_modulus(body, "poisson", *work.of_lame()),
         "density": lambda: of_density(body, of_mass),
         "activation": lambda: work.of_activation().reshape(body.worlds, -1),
-        "rest": lambda: work.of_rest() + work.of_weights(weight_densities(body, of_mass)),
+        "rest": lambda: work.of_rest() + work.of_weights(weight_densities(body, of_mass)) + boundary,
+        "boundary": lambda: boundary,
     }
-    return {name: found[name]() for name in names if name in found}
+    return {
+        name: places[name] if name in places else found[name]() for name in names if name in places or name in found
+    }
 
 
 #: Names of derivatives of static answers, and the sums of ``ElementWork`` that each of them needs.

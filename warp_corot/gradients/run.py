@@ -314,9 +314,7 @@ def run_gradient(
         run = ImplicitRun(sums, seen, sim, len(things), adjoint_tolerance)
     of_u, of_v = run.adjoint()
     of_obstacles = run.of_obstacles if isinstance(run, ImplicitRun) else np.zeros((len(things), 3))
-    found = sums.derivatives() | {"displacements": of_u, "velocities": of_v, "obstacles": of_obstacles}
-    if "rest" in names:
-        found["rest"] = found["rest"] + of_u
+    found = sums.derivatives(boundary=of_u, displacements=of_u, velocities=of_v, obstacles=of_obstacles)
     return RunGradient(value=seen.value, kept=run.kept, **{name: found[name] for name in names})
 
 

@@ -119,16 +119,8 @@ class RestState:
         of_obstacles = np.zeros((len(self.obstacles), 3))
         if self.contact is not None:
             of_obstacles = self.contact.of_obstacles(moved, adjoint.multipliers)
-        found = derivatives(self.body, work, names, moved, moved @ self.gravity)
-        return found | _of_places(found, names, boundary, of_obstacles)
-
-
-def _of_places(found: dict[str, Any], names: Sequence[str], boundary: Array, of_obstacles: Array) -> dict[str, Any]:
-    """The derivatives with respect to places, of those that are asked for; "rest" is found except for held nodes."""
-    # Held nodes keep their displacements, so their places follow the rest shape.
-    of_rest = {"rest": found["rest"] + boundary} if "rest" in names else {}
-    others = {"boundary": boundary, "obstacles": of_obstacles}
-    return of_rest | {name: others[name] for name in names if name in others}
+        places = {"boundary": boundary, "obstacles": of_obstacles}
+        return derivatives(self.body, work, names, moved, moved @ self.gravity, **places)
 
 
 def bound(body: SoftBody, law: Model, names: Sequence[str]) -> tuple[ForceField, set[str]]:
@@ -356,5 +348,5 @@ class PreciseState:
 
         # As an ``ElementWork``.
         work = SimpleNamespace(of_lame=lambda: (of_mu, of_lam), of_rest=lambda: of_rest, of_weights=of_weights)
-        found = derivatives(self.body, work, names, flat, flat @ self._gravity)
-        return found | _of_places(found, names, boundary.reshape(-1, 3), of_obstacles)
+        places = {"boundary": boundary.reshape(-1, 3), "obstacles": of_obstacles}
+        return derivatives(self.body, work, names, flat, flat @ self._gravity, **places)

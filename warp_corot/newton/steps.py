@@ -297,21 +297,16 @@ class Others:
         self._solver: SolverSemiImplicit | None = None
         if self.has_particles or (own and model.body_count):
             view = ModelView(model, "warp_corot_others")
-            view.tet_count = 0
-            if not triangles:
-                view.tri_count = 0
-            if not edges:
-                view.edge_count = 0
-            if not self.has_particles:
-                view.particle_count = 0
+            stays = {"tet_count": False, "tri_count": triangles, "edge_count": edges}
+            stays |= {"particle_count": self.has_particles, "body_count": own, "joint_count": own}
+            for name in (name for name, is_here in stays.items() if not is_here):
+                setattr(view, name, 0)
             if not particle_contact:
                 view.particle_grid = None
             elif model.device.is_cpu and model.particle_grid is not None:
                 # About as many cells as particles: clearing Newton's two million would dominate a step.
                 size = 2 ** math.ceil(math.log2(max(model.particle_count, 1)) / 3)
                 view.particle_grid = wp.HashGrid(*3 * [min(max(size, 8), 128)], device=model.device)
-            if not own and model.body_count:
-                view.body_count = view.joint_count = 0
             try:
                 self._solver = SolverSemiImplicit(view, enable_tri_contact=False)
             except ValueError as error:
