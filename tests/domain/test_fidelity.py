@@ -5,7 +5,8 @@ import pytest
 import trimesh
 
 from warp_corot.domain import Domain
-from warp_corot.domain.fidelity import fidelity, reference_of, smallest_dihedral, volume_along_lines
+from warp_corot.domain.fidelity import fidelity, smallest_dihedral
+from warp_corot.domain.reference import reference_of, volume_along_lines
 from warp_corot.holding.choice import supports_of
 from warp_corot.mesh import TetForest, TetMesh
 from warp_corot.mesh.topology import pieces_of

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from enum import Enum
-from typing import TYPE_CHECKING, TypeAlias
+from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -21,13 +21,6 @@ from warp_corot.errors import InputError
 from warp_corot.inputs.cpu_threads import launch, part_of
 from warp_corot.kernels.elements.elements import GeneralElements, Subtrees, gather_slots
 from warp_corot.kernels.plan.slots import find_starts
-
-if TYPE_CHECKING:
-    from .changing.plan import DevicePlan
-    from .planner import ForcePlan
-
-#: The units of work of a force field, for a mesh that never changes, or one that does.
-Plan: TypeAlias = "ForcePlan | DevicePlan"
 
 #: Slots are numbered in 32 bits.
 MOST_SLOTS = 2**31 - 1
@@ -225,6 +218,49 @@ class LeafCounts:
     before: wp.array
     goes: wp.array
     threads: int
+
+
+class Plan(Protocol):
+    """The units of work of a force field, for any mesh.
+
+    Attributes:
+        elements: All leaves, ``ForestElements`` or, of a general mesh, ``GeneralElements`` of ``kernels.elements``;
+            their forces go to the slots if there are any.
+        batches: Subtrees by type, grouped or not, and sharing; none if the field computes leaf by leaf.
+        flat: The other leaves.
+        slots: The places to which kernels first add forces if sums must have a fixed order, else None.
+        counts: The number of leaves, if it changes, else None.
+    """
+
+    @property
+    def elements(self) -> Elements: ...
+
+    @property
+    def batches(self) -> tuple[Batch, ...]: ...
+
+    @property
+    def flat(self) -> FlatLeaves: ...
+
+    @property
+    def units(self) -> Units | None:
+        """The units, if a batch or a flat leaf uses their rotations, else None."""
+        ...
+
+    @property
+    def all_units(self) -> Units:
+        """The units, also if no launch of forces uses them; only if rotations are shared."""
+        ...
+
+    @property
+    def kinds(self) -> list[tuple[int, bool, Sharing]]:
+        """Shape, whether in groups, and sharing of all possible batches."""
+        ...
+
+    @property
+    def slots(self) -> Slots | None: ...
+
+    @property
+    def counts(self) -> LeafCounts | None: ...
 
 
 # --- nodes whose displacements arrive during a step ------------------------------------------------------------------

@@ -379,17 +379,10 @@ def slots_of(
 
 @dataclass(frozen=True)
 class ForcePlan:
-    """The units of work of a force field on a mesh that never changes.
+    """The ``Plan`` of a mesh that never changes.
 
     Attributes:
-        elements: All leaves, ``ForestElements`` or, of a general mesh, ``GeneralElements`` of ``kernels.elements``;
-            their forces go to the slots if there are any.
-        batches: Subtrees by type, grouped or not, and sharing; none if the field computes leaf by leaf.
-        flat: The other leaves.
-        units: The units, if a batch or a flat leaf uses their rotations, else None.
-        slots: The places to which kernels first add forces if sums must have a fixed order, else None.
         find_units: A function that makes ``all_units`` for a forest with shared rotations.
-        counts: The number of leaves, if it changes, else None.
     """
 
     elements: Elements
@@ -402,13 +395,11 @@ class ForcePlan:
 
     @cached_property
     def all_units(self) -> Units:
-        """The units, also if no launch of forces uses them; only if rotations are shared."""
         assert self.find_units is not None
         return self.units or self.find_units()
 
     @property
     def kinds(self) -> list[tuple[int, bool, Sharing]]:
-        """Shape, whether in groups, and sharing of all batches."""
         return [(batch.shape, batch.grouped, batch.sharing) for batch in self.batches]
 
     @classmethod

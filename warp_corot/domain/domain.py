@@ -189,22 +189,22 @@ class Domain:
 
         In a union, the label of the first domain that holds a point counts: ``tumour.named("tumour") | liver``.
         """
-        from .shapes import NamedDomain
+        from .surface import NamedDomain
 
         return NamedDomain(self, name)
 
     def __or__(self, other: Domain) -> Domain:
-        from .shapes import UnionDomain
+        from .surface import UnionDomain
 
         return UnionDomain(self, other) if isinstance(other, Domain) else NotImplemented
 
     def __and__(self, other: Domain) -> Domain:
-        from .shapes import IntersectionDomain
+        from .surface import IntersectionDomain
 
         return IntersectionDomain(self, other) if isinstance(other, Domain) else NotImplemented
 
     def __sub__(self, other: Domain) -> Domain:
-        from .shapes import DifferenceDomain
+        from .surface import DifferenceDomain
 
         return DifferenceDomain(self, other) if isinstance(other, Domain) else NotImplemented
 
@@ -348,21 +348,21 @@ class Domain:
             InputError: The box is empty, the function has another form, is not finite in the box, or changes faster
                 than ``lipschitz`` says.
         """
-        from .shapes import FunctionDomain
+        from .surface import FunctionDomain
 
         return FunctionDomain(function, bounds, lipschitz, up_axis=up_axis, device=device)
 
     @classmethod
     def sphere(cls, radius: float, centre: Sequence[float] = (0.0, 0.0, 0.0), **options: Any) -> Domain:
         """A ball [m]. Options here and below: ``up_axis``, ``device``."""
-        from .shapes import sphere
+        from .surface import sphere
 
         return sphere(radius, centre, **options)
 
     @classmethod
     def box(cls, lower: Sequence[float], upper: Sequence[float], **options: Any) -> Domain:
         """An axis-aligned box between two corners [m]."""
-        from .shapes import box
+        from .surface import box
 
         return box(lower, upper, **options)
 
@@ -371,14 +371,14 @@ class Domain:
         cls, major: float, minor: float, centre: Sequence[float] = (0.0, 0.0, 0.0), axis: str = "Z", **options: Any
     ) -> Domain:
         """A ring: a tube of radius ``minor`` around a circle of radius ``major`` [m] about an axis."""
-        from .shapes import torus
+        from .surface import torus
 
         return torus(major, minor, centre, axis, **options)
 
     @classmethod
     def capsule(cls, start: Sequence[float], end: Sequence[float], radius: float, **options: Any) -> Domain:
         """All points within ``radius`` of the segment between two points [m]."""
-        from .shapes import capsule
+        from .surface import capsule
 
         return capsule(start, end, radius, **options)
 

@@ -7,8 +7,7 @@ lattice. The tree has every ancestor; the leaves are the mesh. Everything is bui
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import replace
 from os import PathLike
 from typing import TYPE_CHECKING
 
@@ -19,10 +18,10 @@ import warp as wp
 from warp_corot.errors import InputError
 from warp_corot.inputs.checks import checked_count, checked_indices, shown
 
-from .lattice import LATTICE_BITS, checked_box, checked_level, volume_shares
+from .forest_arrays import ForestArrays
+from .lattice import LATTICE_BITS, checked_box
 from .surfaces.bodies import largest_piece, separating_surface, summary, surface
 from .surfaces.bound import SurfaceMesh, embed
-from .tetmesh import LabelledMesh
 from .topology import pieces_of
 from .tree import VOID, Tree, UniformTree, at_midpoints, renumbered, with_virtual
 from .uniform import halvings, uniform_leaves
@@ -31,14 +30,12 @@ if TYPE_CHECKING:
     from warp_corot.domain import Domain
 
     from .growing.refinement_criteria import Field
-    from .surfaces.marching import Detail
 
 #: Leaves are numbered in 32 bits.
 MAX_LEAVES = 2**31 - 1
 
 
-@dataclass(frozen=True, eq=False, repr=False)
-class TetForest(LabelledMesh):
+class TetForest(ForestArrays):
     """A conforming mesh of right-angled tetrahedra of three shapes, the leaves of a forest of binary trees.
 
     Attributes:
@@ -60,24 +57,6 @@ class TetForest(LabelledMesh):
         snap: From each node on a cut to the surface that cut there [m], float32 [N, 3]; None: nothing was cut.
         detail: The parts of the body's surface that were resolved more finely than the mesh; None: there are none.
     """
-
-    cells: tuple[int, int, int]
-    cell_size: float
-    origin: tuple[float, float, float]
-    lattice: np.ndarray
-    node_ends: np.ndarray
-    tree: Tree
-    up_axis: str = "Y"
-    phi: np.ndarray | None = None
-    fill: np.ndarray | None = None
-    labels: np.ndarray | None = None
-    node_labels: np.ndarray | None = None
-    label_names: tuple[str, ...] = ()
-    detail: Detail | None = None
-    snap: np.ndarray | None = None
-    #: Groups of leaves that share a dilatation, int32 [T], if a larger forest gives them; None: they are found when
-    #: needed.
-    leaf_groups: np.ndarray | None = None
 
     def __repr__(self) -> str:
         return f"<TetForest of {len(self.levels)} tetrahedra and {self.node_count} nodes>"
@@ -177,58 +156,6 @@ class TetForest(LabelledMesh):
         wishes = checked_wishes(max_level, surface_error, min_level, refine_where, field, field_tolerance)
         target = 0 if target_elements is None else checked_count(target_elements, "target_elements", 1)
         return mesh_domain(domain, Budget(target, cell_size, max_level, min_layers, wishes), detail, sliver, device)
-
-    @cached_property
-    def points(self) -> np.ndarray:  # type: ignore[override]
-        """Rest positions of the nodes [m], float64 [N, 3]."""
-        return self.lattice_points[: self.node_count]
-
-    @cached_property
-    def lattice_points(self) -> np.ndarray:
-        """Rest positions of all lattice points [m], the N nodes first, float64."""
-        return np.asarray(self.origin) + self.lattice * (self.cell_size / 2**LATTICE_BITS)
-
-    @cached_property
-    def node_count(self) -> int:
-        """Number of nodes N that leaves name."""
-        return len(self.lattice) if isinstance(self.tree, UniformTree) else int(self.tets.max()) + 1
-
-    @cached_property
-    def tets(self) -> np.ndarray:  # type: ignore[override]
-        """The leaves' nodes in Maubach order, in tree order, int32 [T, 4]."""
-        return self.tree.leaf_tets
-
-    @cached_property
-    def levels(self) -> np.ndarray:
-        """Level of each leaf, int32 [T]; for a uniform mesh a broadcast number, which takes no memory."""
-        return self.tree.leaf_levels
-
-    @cached_property
-    def volumes(self) -> np.ndarray:
-        """Rest volume of each leaf [m^3], float64 [T]; for a uniform mesh a broadcast number, like ``levels``."""
-        if isinstance(self.tree, UniformTree):
-            return np.broadcast_to(volume_shares(self.tree.depth) * self.cell_size**3, self.levels.shape)
-        return volume_shares(self.levels) * self.cell_size**3
-
-    def ancestors(self, level: int) -> np.ndarray:
-        """For each leaf, its highest ancestor, or itself, that is not above ``level`` and whose corners are nodes.
-
-        Except at the border of a body, this is the ancestor at ``level``. Returns indices into the tree, int32 [T].
-        """
-        level = checked_level(level, "level")
-        if self.node_count == len(self.lattice):
-            return self.tree.ancestors(self.tree.leaves, level)
-        tree, found = self.tree, self.tree.leaves.copy()
-        on_nodes = np.less(tree.tets.max(axis=1), self.node_count)
-        below = np.flatnonzero(tree.level[found] > level)
-        climbed = found[below]
-        while len(below):
-            climbed = tree.parent[climbed]
-            real = on_nodes[climbed]
-            found[below[real]] = climbed[real]
-            further = tree.level[climbed] > level
-            below, climbed = below[further], climbed[further]
-        return found
 
     def refine(self, leaves: npt.ArrayLike) -> TetForest:
         """A forest in which the chosen leaves are bisected, and as many others as conformity needs.

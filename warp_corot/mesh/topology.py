@@ -111,21 +111,17 @@ def boundary_faces(tets: ArrayLike, points: ArrayLike | None = None) -> tuple[ND
     return corners[boundary], (boundary // 4).astype(np.int32)
 
 
-def _sort_faces(corners: NDArray[np.int32]) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
+def _sort_faces(corners: NDArray[np.int32]) -> tuple[NDArray[np.integer], NDArray[np.bool_]]:
     """An order in which equal faces (as sets of nodes) are neighbours, and where in it a new face begins."""
-    low = corners.min(axis=1).astype(np.uint64)
-    high = corners.max(axis=1).astype(np.uint64)
-    middle = corners.astype(np.int64).sum(axis=1).astype(np.uint64) - low - high
+    a, b, c = corners.T.astype(np.int64)
+    low, high = np.minimum(np.minimum(a, b), c), np.maximum(np.maximum(a, b), c)
     count = int(high.max()) + 1
-    pair = low * np.uint64(count) + middle
-    keys = (pair * np.uint64(count) + high,) if count**3 < 2**64 else (high, pair)
-    order = np.argsort(keys[0], kind="stable") if len(keys) == 1 else np.lexsort(keys)
-    first = np.zeros(len(order), bool)
-    first[0] = True
-    for key in keys:
-        ordered = key[order]
-        first[1:] |= ordered[1:] != ordered[:-1]
-    return order, first
+    pair = low * count + (a + b + c - low - high)
+    if count**3 <= 2**63:
+        keys, order = sorted_keys(pair * count + high, count**3)
+        return order, np.append(True, keys[1:] != keys[:-1])
+    order = np.lexsort((high, pair))
+    return order, np.append(True, (np.diff(pair[order]) != 0) | (np.diff(high[order]) != 0))
 
 
 Array = np.ndarray
@@ -147,19 +143,9 @@ def pieces_of(tets: npt.NDArray[np.integer]) -> npt.NDArray[np.int32]:
 
 def face_pairs(tets: Array) -> Array:
     """Pairs of elements that share a face [m, 2]."""
-    a, b, c, d = np.sort(tets, axis=1).astype(np.int64).T
-    count = int(tets.max()) + 1
-    ab, cd = a * count + b, c * count + d
-    if count**3 <= 2**63:
-        keys = np.concatenate([b * count**2 + cd, a * count**2 + cd, ab * count + d, ab * count + c])
-        keys, order = sorted_keys(keys, count**3)
-        same = keys[1:] == keys[:-1]
-    else:
-        first = np.concatenate([b * count + c, a * count + c, ab, ab])
-        last = np.concatenate([d, d, d, c])
-        order = np.lexsort((last, first))
-        same = (first[order[1:]] == first[order[:-1]]) & (last[order[1:]] == last[order[:-1]])
-    return np.sort(np.stack([order[:-1][same], order[1:][same]], axis=1) % len(tets), axis=1)
+    order, first = _sort_faces(np.ascontiguousarray(tets)[:, FACES_OF_TET].reshape(-1, 3))
+    same = np.flatnonzero(~first)
+    return np.sort(np.stack([order[same - 1], order[same]], axis=1) // 4, axis=1)
 
 
 def linked(pairs: Array, count: int) -> Array:

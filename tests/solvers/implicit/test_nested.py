@@ -5,7 +5,7 @@ import pytest
 from cases import CUBE
 
 import warp_corot as wc
-from warp_corot.mesh.tree import coarser
+from warp_corot.mesh.coarser import coarser
 from warp_corot.solvers.implicit import static
 from warp_corot.solvers.implicit.static import StaticSolver
 

@@ -130,7 +130,7 @@ def chosen_meshes(domain: Domain, budget: Budget, sliver: float, device: wp.Devi
 
 def predicted_cell_size(domain: Domain, target: int) -> float:
     """The edge [m] of cubes that fill a body with about this number of elements."""
-    from warp_corot.domain.fidelity import extent_of
+    from warp_corot.domain.reference import extent_of
 
     volume, area = extent_of(domain)
     way = float(np.clip(np.log(target / FEWER) / np.log(MORE / FEWER), 0.0, 1.0))

@@ -19,7 +19,7 @@ from .fine_classification import LEAST, MOST_POINTS, Resolved, label_shares
 
 if TYPE_CHECKING:
     from warp_corot.domain import Domain
-    from warp_corot.mesh.forest import TetForest
+    from warp_corot.mesh.forest_arrays import ForestArrays
 
 Ints = npt.NDArray[np.int32]
 Longs = npt.NDArray[np.int64]
@@ -55,7 +55,7 @@ def labels_of(
     resolved: Resolved,
     child: np.ndarray,
     elements: np.ndarray,
-    forest: TetForest,
+    forest: ForestArrays,
     domain: Domain,
     growers: Growers = ALONE,
 ) -> Ints:
@@ -212,7 +212,7 @@ def _assigned(
     return best
 
 
-def _with_points(labels: Ints, forest: TetForest, domain: Domain, growers: Growers) -> Ints:
+def _with_points(labels: Ints, forest: ForestArrays, domain: Domain, growers: Growers) -> Ints:
     """The labels, with those that no element has at an element each, if a point of them is known and the element is not
     another label's only one."""
     there = np.sum(growers.gathered(np.bincount(labels, minlength=len(domain.label_names) + 1)), axis=0)
@@ -230,7 +230,7 @@ def _with_points(labels: Ints, forest: TetForest, domain: Domain, growers: Growe
     return labels
 
 
-def _at(forest: TetForest, point: np.ndarray, growers: Growers) -> tuple[float, int]:
+def _at(forest: ForestArrays, point: np.ndarray, growers: Growers) -> tuple[float, int]:
     """The element in which a point is deepest, or outside which it is least far, by its smallest barycentric
     coordinate; and that coordinate."""
     corners = forest.points[forest.tets]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -21,7 +21,9 @@ from .bound import SurfaceMesh, barycentric, embed
 from .marching import marched, marched_cut, separated
 
 if TYPE_CHECKING:
-    from warp_corot.mesh.forest import TetForest
+    from warp_corot.mesh.forest_arrays import ForestArrays
+
+Forest = TypeVar("Forest", bound="ForestArrays")
 
 #: A node's way to a line is in the plane of its own cut if it is off by at most this share of its length.
 IN_PLANE = 0.02
@@ -29,7 +31,7 @@ IN_PLANE = 0.02
 LEAST = 0.1
 
 
-def surface(forest: TetForest) -> SurfaceMesh:
+def surface(forest: ForestArrays) -> SurfaceMesh:
     """See `TetForest.surface`."""
     if forest.phi is None:
         found = boundary_surface(forest)
@@ -48,7 +50,7 @@ def surface(forest: TetForest) -> SurfaceMesh:
     return found if len(found.triangles) else boundary_surface(forest)
 
 
-def separating_surface(forest: TetForest) -> SurfaceMesh:
+def separating_surface(forest: ForestArrays) -> SurfaceMesh:
     """See `TetForest.separating_surface`."""
     if forest.phi is None or forest.node_labels is None:
         raise InputError("this mesh has no labels; it must be made from a domain that has labels")
@@ -61,7 +63,7 @@ def separating_surface(forest: TetForest) -> SurfaceMesh:
     return _on_nodes(forest, separated(forest.lattice_points, _all_cut(forest), forest.phi, forest.node_labels))
 
 
-def largest_piece(forest: TetForest) -> TetForest:
+def largest_piece(forest: Forest) -> Forest:
     """See `TetForest.largest_piece`."""
     kept = pieces_of(forest.tets) == 0
     if kept.all():
@@ -89,7 +91,7 @@ def largest_piece(forest: TetForest) -> TetForest:
     )
 
 
-def summary(forest: TetForest) -> list[str]:
+def summary(forest: ForestArrays) -> list[str]:
     """See `TetForest.summary`."""
     x, y, z = forest.cells
     count = len(forest.tets)
@@ -108,14 +110,14 @@ def summary(forest: TetForest) -> list[str]:
     return lines
 
 
-def _all_cut(forest: TetForest) -> np.ndarray:
+def _all_cut(forest: ForestArrays) -> np.ndarray:
     """Nodes of all leaves that hold a part of the body, including leaves that were left out, int32 [n, 4]."""
     assert forest.phi is not None
     tets = forest.tree.tets[forest.tree.first_child < 0]
     return tets[(forest.phi[tets] < 0).any(axis=1)]
 
 
-def _cut_apart(forest: TetForest) -> np.ndarray:
+def _cut_apart(forest: ForestArrays) -> np.ndarray:
     """As `_all_cut`, but for leaves that were left out and have nodes inside that no element joins: a cut may be
     between them."""
     assert forest.phi is not None
@@ -130,14 +132,14 @@ def _cut_apart(forest: TetForest) -> np.ndarray:
     return np.concatenate([forest.tets[is_inside[forest.tets].any(axis=1)], left_out[whole]])
 
 
-def _elements_at(forest: TetForest, nodes: np.ndarray) -> np.ndarray:
+def _elements_at(forest: ForestArrays, nodes: np.ndarray) -> np.ndarray:
     """An element around each node."""
     element = np.zeros(forest.node_count, np.int64)
     element[forest.tets] = np.arange(len(forest.tets))[:, None]
     return element[nodes]
 
 
-def _snapped(forest: TetForest, found: SurfaceMesh, edges_of: SurfaceMesh) -> SurfaceMesh:
+def _snapped(forest: ForestArrays, found: SurfaceMesh, edges_of: SurfaceMesh) -> SurfaceMesh:
     """The surface with points on cuts where the cuts went, bound to an element on their side.
 
     Args:
@@ -167,7 +169,7 @@ def _snapped(forest: TetForest, found: SurfaceMesh, edges_of: SurfaceMesh) -> Su
     return replace(found, points=x, nodes=nodes, weights=weights)
 
 
-def _moves_to_cuts(forest: TetForest, edges_of: SurfaceMesh) -> tuple[np.ndarray, np.ndarray]:
+def _moves_to_cuts(forest: ForestArrays, edges_of: SurfaceMesh) -> tuple[np.ndarray, np.ndarray]:
     """The way from each point to the cut at the ends of its edge [V, 3], and whether it is on a face of a cut [V].
 
     An end and its way to the cut make a plane; if the other end has no such way, that of the point is across it.
@@ -185,7 +187,7 @@ def _moves_to_cuts(forest: TetForest, edges_of: SurfaceMesh) -> tuple[np.ndarray
     return np.where(total[:, None] < 0.999, planes, np.einsum("vn,vnc->vc", weights, snap)), on_cut
 
 
-def _shared_snaps(forest: TetForest) -> np.ndarray:
+def _shared_snaps(forest: ForestArrays) -> np.ndarray:
     """The way from each node to the cuts there, float64 [N, 3]: of the nodes at one point the longest, which leads to
     all cuts that meet there, so that there are no gaps between pieces.
 
@@ -205,7 +207,7 @@ def _shared_snaps(forest: TetForest) -> np.ndarray:
     return np.where(stays[:, None], shared, snap)
 
 
-def _within_faces(forest: TetForest, nodes: np.ndarray, moves: np.ndarray) -> np.ndarray:
+def _within_faces(forest: ForestArrays, nodes: np.ndarray, moves: np.ndarray) -> np.ndarray:
     """Moves [n, 3] of nodes of a box, which stay in its faces and end on the same cut."""
     lattice = forest.lattice[nodes]
     is_free = (lattice > 0) & (lattice < np.array(forest.cells) << LATTICE_BITS)
@@ -214,7 +216,7 @@ def _within_faces(forest: TetForest, nodes: np.ndarray, moves: np.ndarray) -> np
     return within * np.where(kept > LEAST * squares, squares / np.where(kept > 0.0, kept, 1.0), 0.0)[:, None]
 
 
-def _of_cuts(forest: TetForest) -> np.ndarray:
+def _of_cuts(forest: ForestArrays) -> np.ndarray:
     """Which faces of the boundary are of cuts, bool [F]."""
     assert forest.tree.cut is not None
     faces, parents = boundary_faces(forest.tets, forest.points)
@@ -222,7 +224,7 @@ def _of_cuts(forest: TetForest) -> np.ndarray:
     return np.asarray((forest.tree.cut[forest.tree.leaves[parents]] >> opposite) & 1 == 1)
 
 
-def _beside(forest: TetForest, ends: np.ndarray, x: np.ndarray, moves: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _beside(forest: ForestArrays, ends: np.ndarray, x: np.ndarray, moves: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The element at an end of each point's edge [n, 2] that holds the moved point best, [n], and whether the point was
     beyond the cut.
 
@@ -245,7 +247,7 @@ def _beside(forest: TetForest, ends: np.ndarray, x: np.ndarray, moves: np.ndarra
     return element[order[np.cumsum(np.bincount(point, minlength=len(x))) - 1]], own > 0.0
 
 
-def _on_rim(forest: TetForest, x: np.ndarray, moves: np.ndarray) -> np.ndarray:
+def _on_rim(forest: ForestArrays, x: np.ndarray, moves: np.ndarray) -> np.ndarray:
     """Points of the body's surface that were moved to a cut [n, 3], moved along the cut to the body's surface again."""
     elements, weights = embed(forest, x)
     corners = forest.tets[elements]
@@ -261,19 +263,19 @@ def _on_rim(forest: TetForest, x: np.ndarray, moves: np.ndarray) -> np.ndarray:
     return x - back * np.where(far > most, most / np.where(far > 0.0, far, 1.0), 1.0)[:, None]
 
 
-def _embedded(forest: TetForest, found: SurfaceMesh) -> SurfaceMesh:
+def _embedded(forest: ForestArrays, found: SurfaceMesh) -> SurfaceMesh:
     """The surface, bound to the nodes of a forest."""
     elements, weights = embed(forest, found.points)
     return replace(found, nodes=forest.tets[elements], weights=weights)
 
 
-def _within(forest: TetForest, detail: Detail, kept: np.ndarray) -> Detail:
+def _within(forest: ForestArrays, detail: Detail, kept: np.ndarray) -> Detail:
     """The part of a detail that is in the elements of a mask bool [T], or nearest to them."""
     elements, _ = embed(forest, detail.points[detail.tets].mean(axis=1))
     return Detail.of(detail.points, detail.tets[kept[elements]], detail.phi, detail.labels)
 
 
-def _on_nodes(forest: TetForest, found: SurfaceMesh) -> SurfaceMesh:
+def _on_nodes(forest: ForestArrays, found: SurfaceMesh) -> SurfaceMesh:
     """The surface, with points that no nodes of the mesh carry bound to the nodes of the nearest element."""
     lost = np.flatnonzero(((found.nodes >= forest.node_count) & (found.weights != 0)).any(axis=1))
     unused = found.nodes >= forest.node_count

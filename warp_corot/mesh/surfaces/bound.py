@@ -21,7 +21,7 @@ from warp_corot.mesh.topology import boundary_faces, coordinates_in
 from warp_corot.mesh.tree import Tree
 
 if TYPE_CHECKING:
-    from warp_corot.mesh.forest import TetForest
+    from warp_corot.mesh.forest_arrays import ForestArrays
 
 #: Points farther away than this many lengths of the mesh are moved to that distance; float32 cannot resolve more.
 FARTHEST = 1.0e3
@@ -110,7 +110,7 @@ def _nearest(
 _WALKS = np.array([[0, 1, 2], [0, 2, 1], [1, 0, 2], [1, 2, 0], [2, 0, 1], [2, 1, 0]])
 
 
-def embed(forest: TetForest, points: npt.ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+def embed(forest: ForestArrays, points: npt.ArrayLike) -> tuple[np.ndarray, np.ndarray]:
     """See `TetForest.embed`."""
     points = checked_points(points)
     found = leaves_at(forest.tree, forest.cells, forest.origin, forest.cell_size, points)
@@ -123,7 +123,7 @@ def embed(forest: TetForest, points: npt.ArrayLike) -> tuple[np.ndarray, np.ndar
     return elements, barycentric(forest, elements, points)
 
 
-def barycentric(forest: TetForest, elements: np.ndarray, points: np.ndarray) -> np.ndarray:
+def barycentric(forest: ForestArrays, elements: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Barycentric coordinates of points in leaves, float64 [n, 4]; some are negative for points outside."""
     return coordinates_in(forest.points[forest.tets[elements]], points)
 

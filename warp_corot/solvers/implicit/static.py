@@ -25,7 +25,7 @@ from warp_corot.elasticity import Corotated, ForceField, Model, NeoHookean
 from warp_corot.kernels.implicit import newton as kernels
 from warp_corot.materials.isotropic import Isotropic
 from warp_corot.mesh import TetForest
-from warp_corot.mesh.tree import Coarser, coarser
+from warp_corot.mesh.coarser import Coarser, coarser
 
 from .block_system import BlockSystem
 from .newton import Newton, NewtonReport
