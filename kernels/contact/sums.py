@@ -45,7 +45,7 @@ def sum_wrenches(
                 sums[3 + axis] = sums[3 + axis] - wp.float64(torque[axis])
         k += threads
     for axis in range(6):
-        sums[axis] = sum_of_lanes(sums[axis])
+        sums[axis] = sum_of_lanes(sums[axis], lanes)
     if thread % lanes == 0:
         parts[o, world, thread / lanes] = parts[o, world, thread / lanes] + sums
 

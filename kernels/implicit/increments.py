@@ -58,13 +58,6 @@ def move_held(
 
 
 @wp.kernel(enable_backward=False)
-def add_product(product: wp.array[wp.vec4], r: wp.array[wp.vec4]):
-    """r += A d."""
-    i = wp.tid()
-    store_node(r, i, load_node(r, i) + load_node(product, i))
-
-
-@wp.kernel(enable_backward=False)
 def take_increments(
     # In
     count: int,

@@ -98,17 +98,3 @@ def add_products(
     """y += A x of blocks of A at pairs of nodes, which may repeat."""
     k = wp.tid()
     add_force(y, first[k], blocks[k] * load_node(x, second[k]))
-
-
-@wp.kernel(enable_backward=False)
-def find_rest(b: wp.array[wp.vec4], q: wp.array[wp.vec4], r: wp.array[wp.vec4]):
-    """r = b - q."""
-    i = wp.tid()
-    store_node(r, i, load_node(b, i) - load_node(q, i))
-
-
-@wp.kernel(enable_backward=False)
-def add_vectors(change: wp.array[wp.vec4], d: wp.array[wp.vec4]):
-    """d += change."""
-    i = wp.tid()
-    store_node(d, i, load_node(d, i) + load_node(change, i))

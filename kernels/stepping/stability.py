@@ -176,17 +176,10 @@ def find_sums(
 
 
 @wp.kernel(enable_backward=False)
-def probe_motion(scale: float, inverse_mass: wp.array[wp.float32], q: wp.array[wp.vec4], u: wp.array[wp.vec4]):
-    """u = scale M^-1/2 q."""
+def weigh(factor: float, inverse_mass: wp.array[wp.float32], a: wp.array[wp.vec4], b: wp.array[wp.vec4]):
+    """b = factor M^-1/2 a."""
     i = wp.tid()
-    store_node(u, i, (scale * wp.sqrt(inverse_mass[i])) * load_node(q, i))
-
-
-@wp.kernel(enable_backward=False)
-def apply_stiffness(scale: float, inverse_mass: wp.array[wp.float32], f: wp.array[wp.vec4], w: wp.array[wp.vec4]):
-    """w = M^-1/2 K M^-1/2 q, from the forces f = -scale K M^-1/2 q."""
-    i = wp.tid()
-    store_node(w, i, (-wp.sqrt(inverse_mass[i]) / scale) * load_node(f, i))
+    store_node(b, i, (factor * wp.sqrt(inverse_mass[i])) * load_node(a, i))
 
 
 @wp.kernel(enable_backward=False)

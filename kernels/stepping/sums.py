@@ -15,25 +15,26 @@ class Sums:
     parts: wp.array3d[wp.float64]  # [worlds, parts, columns]
 
 
-@wp.func_native("""
+_OVER_LANES = """
 #if defined(__CUDA_ARCH__)
-    for (int k = 16; k > 0; k >>= 1) value += __shfl_down_sync(0xffffffffu, value, k);
+    if (lanes > 1) for (int k = 16; k > 0; k >>= 1) {{
+        const wp::float64 other = __shfl_down_sync(0xffffffffu, value, k);
+        value = {0};
+    }}
 #endif
     return value;
-""")
-def sum_of_lanes(value: wp.float64) -> wp.float64:
-    """The sum over the warp, in a fixed order, in the first lane; a CPU has one lane."""
+"""
+
+
+@wp.func_native(_OVER_LANES.format("value + other"))
+def sum_of_lanes(value: wp.float64, lanes: int) -> wp.float64:
+    """The sum over the lanes, in a fixed order, in the first one."""
     ...
 
 
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-    for (int k = 16; k > 0; k >>= 1) value = fmax(value, __shfl_down_sync(0xffffffffu, value, k));
-#endif
-    return value;
-""")
-def most_of_lanes(value: wp.float64) -> wp.float64:
-    """The largest value of the warp, in the first lane."""
+@wp.func_native(_OVER_LANES.format("fmax(value, other)"))
+def most_of_lanes(value: wp.float64, lanes: int) -> wp.float64:
+    """The largest value of the lanes, in the first one."""
     ...
 
 
@@ -44,17 +45,9 @@ def dot64(a: wp.vec3, b: wp.vec3):
 
 
 @wp.func
-def sum_of_part(value: wp.float64, sums: Sums):
-    total = value
-    if sums.lanes > 1:
-        total = sum_of_lanes(value)
-    return total
-
-
-@wp.func
 def store_sum(sums: Sums, world: int, thread: int, column: int, value: wp.float64):
     """Write the sum of the values of a part's threads."""
-    total = sum_of_part(value, sums)
+    total = sum_of_lanes(value, sums.lanes)
     if thread % sums.lanes == 0:
         sums.parts[world, thread / sums.lanes, column] = total
 
@@ -62,24 +55,16 @@ def store_sum(sums: Sums, world: int, thread: int, column: int, value: wp.float6
 @wp.func
 def add_sum(sums: Sums, world: int, thread: int, column: int, value: wp.float64):
     """Add the sum of the values of a part's threads to the part."""
-    total = sum_of_part(value, sums)
+    total = sum_of_lanes(value, sums.lanes)
     if thread % sums.lanes == 0:
         part = thread / sums.lanes
         sums.parts[world, part, column] = sums.parts[world, part, column] + total
 
 
 @wp.func
-def most_of_part(value: wp.float64, sums: Sums):
-    most = value
-    if sums.lanes > 1:
-        most = most_of_lanes(value)
-    return most
-
-
-@wp.func
 def store_most(sums: Sums, world: int, thread: int, column: int, value: wp.float64):
     """Write the largest of the values of a part's threads."""
-    most = most_of_part(value, sums)
+    most = most_of_lanes(value, sums.lanes)
     if thread % sums.lanes == 0:
         sums.parts[world, thread / sums.lanes, column] = most
 
@@ -87,7 +72,7 @@ def store_most(sums: Sums, world: int, thread: int, column: int, value: wp.float
 @wp.func
 def add_most(sums: Sums, world: int, thread: int, column: int, value: wp.float64):
     """Let the part be the largest of these values and its own."""
-    most = most_of_part(value, sums)
+    most = most_of_lanes(value, sums.lanes)
     if thread % sums.lanes == 0:
         part = thread / sums.lanes
         sums.parts[world, part, column] = wp.max(sums.parts[world, part, column], most)
@@ -99,7 +84,7 @@ def add_up(sums: Sums, world: int, lane: int, column: int):
     total = wp.float64(0.0)
     for k in range(lane, sums.parts.shape[1], sums.lanes):
         total += sums.parts[world, k, column]
-    return sum_of_part(total, sums)
+    return sum_of_lanes(total, sums.lanes)
 
 
 @wp.func
@@ -108,4 +93,4 @@ def largest(sums: Sums, world: int, lane: int, column: int):
     most = wp.float64(0.0)
     for k in range(lane, sums.parts.shape[1], sums.lanes):
         most = wp.max(most, sums.parts[world, k, column])
-    return most_of_part(most, sums)
+    return most_of_lanes(most, sums.lanes)

@@ -18,9 +18,10 @@ from warp_corot.kernels.elements.forces import add_stiffness_product
 from warp_corot.kernels.elements.simd8 import LANES
 from warp_corot.kernels.implicit import conjugate_gradients, increments
 from warp_corot.kernels.implicit.steps import count_solves
-from warp_corot.kernels.implicit.tangent import add_vectors, finish_blocks, finish_rows
+from warp_corot.kernels.implicit.tangent import finish_blocks, finish_rows
 from warp_corot.kernels.newton import implicit as kernels
 from warp_corot.kernels.newton.particles import Particles
+from warp_corot.kernels.stepping.stability import add_scaled
 from warp_corot.mesh.topology import connected
 from warp_corot.solvers.implicit.block_system import BlockSystem
 from warp_corot.solvers.implicit.conjugate_gradients import WorldSums
@@ -351,7 +352,7 @@ class ImplicitSteps(Steps):
             wp.copy(self._rounds, rows.solves, count=1)
         else:
             system.update()
-            self._launch(add_vectors, len(system.x), [fall], [system.x])
+            self._launch(add_scaled, len(system.x), [1.0, fall], [system.x])
             system.solve(guessed=True)
             linear = system.solver.iterations
             self._rounds.fill_(1)

@@ -112,12 +112,12 @@ def largest_eigenvalue(
         forces.add_forces(u, at_rest)
         for step in range(min(LANCZOS_STEPS, 3 * free)):
             scale = probe * off[-1] / largest if largest > 0.0 else 1.0
-            launch(kernels.probe_motion, scale, inverse_mass, q, u)
+            launch(kernels.weigh, scale, inverse_mass, q, u)
             ranks.exchange(number, u)
             f.zero_()
             launch(kernels.add_scaled, -1.0, at_rest, f)
             forces.add_forces(u, f)
-            launch(kernels.apply_stiffness, scale, inverse_mass, f, after)
+            launch(kernels.weigh, -1.0 / scale, inverse_mass, f, after)
             if step > 0:
                 launch(kernels.add_scaled, -off[-1], before, after)
             diagonal.append(sums(q, after)[0])

@@ -12,6 +12,7 @@ from warp_corot.inputs.loading import load
 from warp_corot.kernels.implicit import conjugate_gradients
 from warp_corot.kernels.implicit import increments as kernels
 from warp_corot.kernels.implicit import newton as kernels_of_newton
+from warp_corot.kernels.stepping.stability import add_scaled
 from warp_corot.solvers.system import Stepper
 
 from .assembled import AssembledSolve, suits
@@ -290,7 +291,7 @@ class StepSolve:
             inputs = [newton.body.conditions.inverse_mass, newton.share, newton.increment]
             self._launch(kernels.take_free, inputs, [newton.step])
         system.apply_bodies(system.x, self._product)
-        self._launch(kernels.add_product, [self._product], [system.b])
+        self._launch(add_scaled, [1.0, self._product], [system.b])
         self._contact.launch()
         self._take_increments()
         self._judge()
