@@ -166,6 +166,11 @@ def take_row(
     n = found.normal
     if was_listed and is_as_asked(r, wp.dot(rows.normal[r], e), law, rows):
         was = rows.multiplier[r]
+    if was_listed and r < rows.first_triangle and found.is_at_end:
+        # Positions are rounded, and stiff rows make forces of that: what is known from motions is more exact.
+        known = rows.gap[r] + wp.dot(rows.normal[r], e) - rows.opened[r]
+        if wp.abs(found.gap - known) <= law.tolerance:
+            found.gap = known
     opened = wp.where(found.is_at_end, found.opened, 0.0)
     target = rows.target[r]
     if not was_listed:
