@@ -36,6 +36,9 @@ CLOSER = wp.constant(4.0)
 STAYS = wp.constant(1.0)
 #: A pair that has begun to push so often in a step is no longer located again.
 OFTEN = wp.constant(3)
+#: From this many solves in a step on, a gap that is found within this part of the law's tolerance of where motions put
+#: it stays there: solves that need so many are kept from their end by rounding.
+LATE, ROUNDED = wp.constant(12), wp.constant(0.125)
 #: The most searches in a step after the first one.
 SEARCHES = wp.constant(8)
 #: What is left in each solve of how far a place has strayed before.
@@ -166,6 +169,11 @@ def take_row(
     n = found.normal
     if was_listed and is_as_asked(r, wp.dot(rows.normal[r], e), law, rows):
         was = rows.multiplier[r]
+    if was_listed and r < rows.first_triangle and found.is_at_end and rows.solves[0] >= LATE:
+        # Positions are rounded, and stiff rows make forces of that: what is known from motions is more exact.
+        known = rows.gap[r] + wp.dot(rows.normal[r], e) - rows.opened[r]
+        if wp.abs(found.gap - known) <= ROUNDED * law.tolerance:
+            found.gap = known
     opened = wp.where(found.is_at_end, found.opened, 0.0)
     target = rows.target[r]
     if not was_listed:

@@ -284,6 +284,8 @@ def test_an_organ_without_flat_feet_lies_on_a_ground(folder, capsys):
     assert "the body lies on a ground, since it has no flat feet, and nothing is fixed (--no-ground or --fix" in err
     assert "organ, lying on a ground" in out
     assert "touches       ground: at -0.0" in out
+    assert "friction 0.3" in out
+    assert "one another" not in out  # there is only one body
     points = [np.array(drawn(Usd.Stage.Open("a.usd"), "/SoftBody/surface", k).vertices) for k in (0, 3)]
     assert points[1][:, 2].min() > points[0][:, 2].min() - 1e-3
     assert points[1][:, 2].max() < points[0][:, 2].max() - 1e-3

@@ -175,9 +175,8 @@ class RunContact:
         """Whether a tool moves."""
         return any(isinstance(each, Tool) and each.keys is not None for each in self.obstacles.values())
 
-    @property
-    def rows(self) -> list[tuple[str, str]]:
-        """Lines of the summary."""
+    def rows(self, bodies: int) -> list[tuple[str, str]]:
+        """Lines of the summary, with this number of bodies."""
         if self.contact is None:
             return []
         found = []
@@ -188,8 +187,9 @@ class RunContact:
             if isinstance(shape, Ground):
                 said = f"at {float(axis_of(shape.quaternion) @ shape.position) + 0.0:.4g} m"
             found.append(f"{name}: {said}")
-        found.append("themselves and one another" if self.contact.self_contact else "one another")
-        found[-1] += f"; friction {self.contact.friction:g}"
+        touches = ["itself" if bodies == 1 else "themselves"] if self.contact.self_contact else []
+        touches += ["one another"] if bodies > 1 else []
+        found.append("; ".join([*filter(None, [" and ".join(touches)]), f"friction {self.contact.friction:g}"]))
         return [("touches" if place == 0 else "", text) for place, text in enumerate(found)]
 
 

@@ -53,7 +53,11 @@ def run(args: argparse.Namespace) -> int:
         rested = asked.record()
     except (KeyboardInterrupt, UnstableError, OSError) as error:
         return early_end(error, asked.done)
-    print(summary(asked.ready.bodies, asked.ready.sim, asked.done, asked.ready.touched.rows, rested))
+    print(
+        summary(
+            asked.ready.bodies, asked.ready.sim, asked.done, asked.ready.touched.rows(len(asked.ready.bodies)), rested
+        )
+    )
     return 0
 
 
