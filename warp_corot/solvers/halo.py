@@ -11,7 +11,6 @@ import warp as wp
 
 if TYPE_CHECKING:
     from warp_corot.body.soft_body import SoftBody
-    from warp_corot.solvers.implicit.multigrid import Multigrid
 
 Floats = npt.NDArray[np.float64]
 V = TypeVar("V", float, int, npt.NDArray[Any], wp.array)
