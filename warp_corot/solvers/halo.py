@@ -34,7 +34,7 @@ class Owned:
     places: npt.NDArray[np.int32]
     nodes: npt.NDArray[np.bool_]
     has_multigrid = True
-    multigrid: Callable[[dict[str, Any]], Multigrid] | None = None
+    multigrid: Callable[[dict[str, Any]], Any] | None = None
 
     def __init__(self, body: SoftBody):
         self.whole = body
