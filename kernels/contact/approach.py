@@ -17,7 +17,7 @@ from .bearing import carriers_of, find_borne
 from .explicit_rows import FORESEEN, OUT, Rigid
 from .explicit_step import push
 from .mass_split import Sums, take_force
-from .motion import Bearing, Dynamics, Foreseen, Surface, distance_between, foreseen, kick_of
+from .motion import Bearing, Foreseen, Part, Surface, distance_between, foreseen, kick_of
 from .shapes import GROUND, distance_to, sure_distance
 from .watch import BESIDE, FAR, FARTHEST, STABLE, Near, Watch, begin_obstacle, pair_of
 
@@ -25,20 +25,6 @@ wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": INLINED})
 
 #: Flags for places that were not visited in the step before, and for those that may touch something in this one.
 LATE, LISTED = wp.constant(16), wp.constant(32)
-
-
-@wp.struct
-class Part:
-    """The surface of a body. Its carriers are places, or the nodes that bear them; see ``Visits``."""
-
-    number: int
-    place: int  # its first place
-    start: int  # its first carrier among ``nodes``
-    shift: int  # how much larger the numbers of these are among all carriers
-    nodes: Surface
-    dynamics: Dynamics
-    pace: Pace
-    offset: int  # the number of the step since the clock was last advanced
 
 
 @wp.struct
@@ -275,15 +261,17 @@ def know(n: int, own: Foreseen, part: Part, visits: Visits):
 
 
 @wp.kernel(enable_backward=False)
-def find_due(begin: int, end: int, part: Part, visits: Visits):
-    """List the carriers from ``begin`` to ``end`` of a body whose budgets this step may use up."""
+def find_due(threads: int, thread: int, start: int, count: int, part: Part, visits: Visits):
+    """List the carriers of a body, so many from a start, whose budgets this step may use up; a thread takes a part of
+    them."""
     body = part.dynamics
     watch = visits.watch
     dt = float(part.pace.seconds[DT])
     damped = 1.0 / (1.0 + dt * body.damping)
     used = visits.came[0] + AHEAD * visits.came[1] + watch.least[0]
     is_first = visits.is_first[0] != 0
-    n = int(begin)
+    n = start + (count * thread) / threads
+    end = start + (count * (thread + 1)) / threads
     while n < end:
         if not is_first and body.load.shape[0] == 0:
             n = next_due(
@@ -294,7 +282,7 @@ def find_due(begin: int, end: int, part: Part, visits: Visits):
             i = part.nodes.node[n]
             c = n + part.shift
             budget = visits.budgets[c]
-            own = foreseen(i, body, part.pace, part.offset)
+            own = foreseen(i, part)
             gone = wp.length(load_node(body.u, i) - wp.vec3(budget[0], budget[1], budget[2]))
             goes = AHEAD * wp.length(own.d)
             if is_first or not (gone + goes <= budget[3] - used):
@@ -353,7 +341,7 @@ def carry(s: int, part: Part, visits: Visits):
         n = c - part.shift
         if claim(visits.carriers, c, visits.count[0], visits.is_shared):
             i = part.nodes.node[n]
-            know(n, foreseen(i, part.dynamics, part.pace, part.offset), part, visits)
+            know(n, foreseen(i, part), part, visits)
             now = load_node(part.dynamics.u, i)
             budget = visits.budgets[c]
             gone = wp.length(now - wp.vec3(budget[0], budget[1], budget[2]))
@@ -502,7 +490,7 @@ def end_visits(
         k += threads
         if sums.touched[n + part.shift] != 0:
             force = take_force(n + part.shift, buffer, grain, sums)
-            push(part.nodes.node[n], force, counts, part.pace, part.offset, part.dynamics, account, contact_forces)
+            push(part.nodes.node[n], force, counts, part, account, contact_forces)
 
 
 @wp.kernel(enable_backward=False)

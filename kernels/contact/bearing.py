@@ -12,9 +12,9 @@ import warp as wp
 from warp_corot.kernels.elements.elements import add_force, load_node, store_node
 from warp_corot.kernels.implicit.assembled import Couplings, couple
 from warp_corot.kernels.modules import INLINED
-from warp_corot.kernels.stepping.pace import DT, Pace
+from warp_corot.kernels.stepping.pace import DT
 
-from .motion import Foreseen, Surface
+from .motion import Foreseen, Part, Surface
 
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": INLINED})
 
@@ -236,31 +236,25 @@ class Carriers:
 @wp.kernel(enable_backward=False)
 def begin_carriers(
     # In
-    start: int,
-    offset: int,
+    part: Part,
     first: int,
-    inverse_mass: wp.array[wp.float32],
     blocks: wp.array[wp.mat33],
-    rest: wp.array[wp.vec4],
-    u: wp.array[wp.vec4],
     increment: wp.array[wp.vec4],
     guess: wp.array[wp.vec4],
     # Out
-    surface: Surface,
     carriers: Carriers,
 ):
     """Where a body's carriers are when a step begins, and how far they may go; held nodes are where it ends.
 
     Args:
-        start: The first one in ``surface``, the places or their bearers.
-        offset: The number of the first carrier there.
         first: The first entry of the body.
         blocks: The blocks on the diagonal of the body's matrix [N/m].
         increment: How far held nodes have gone in the step [m].
         guess: How far free nodes may go [m].
     """
-    s = start + wp.tid()
-    c = offset + s
+    s = part.start + wp.tid()
+    c = part.shift + s
+    surface = part.nodes
     i = surface.node[s]
     surface.f[s] = wp.vec3()
     surface.d[s] = wp.vec3()
@@ -270,12 +264,12 @@ def begin_carriers(
     carriers.entry[c] = -1
     if i < 0:
         return
-    home = load_node(rest, i)
+    home = load_node(part.dynamics.rest, i)
     surface.rest[s] = home
-    surface.x[s] = home + load_node(u, i)
+    surface.x[s] = home + load_node(part.dynamics.u, i)
     surface.d[s] = load_node(guess, i)
     carriers.entry[c] = first + i
-    if inverse_mass[i] > 0.0:
+    if part.dynamics.inverse_mass[i] > 0.0:
         surface.yielding[s] = 1.0
         carriers.compliance[c] = 3.0 / wp.max(wp.trace(blocks[i]), 1.0e-30)
     else:
@@ -378,15 +372,15 @@ def mark_carriers(s: int, mark: int, surface: Surface, marked: wp.array[wp.int32
 
 
 @wp.kernel(enable_backward=False)
-def end_carriers(start: int, are_bearers: int, nodes: Surface, surface: Surface, contact_forces: wp.array[wp.vec4]):
-    """Write the forces at a body's carriers, the ``nodes``, for users: those at the places of ``surface``."""
-    s = start + wp.tid()
-    i = nodes.node[s]
+def end_carriers(part: Part, surface: Surface, contact_forces: wp.array[wp.vec4]):
+    """Write the forces at a body's carriers for users: those at the places of ``surface``."""
+    s = part.start + wp.tid()
+    i = part.nodes.node[s]
     if i < 0:
         return
-    if are_bearers != 0:
-        nodes.f[s] = borne_force(s, surface)
-    store_node(contact_forces, i, nodes.f[s])
+    if part.shift > 0:
+        part.nodes.f[s] = borne_force(s, surface)
+    store_node(contact_forces, i, part.nodes.f[s])
 
 
 #: What a node has touched is a number of bits: those of ``implicit_rows.mark_acting`` after the last step, and whether
@@ -395,46 +389,27 @@ CHANGED = wp.constant(1 << 30)
 
 
 @wp.kernel(enable_backward=False)
-def foresee_places(
-    # In
-    start: int,
-    rest: wp.array[wp.vec4],
-    u: wp.array[wp.vec4],
-    v: wp.array[wp.vec4],
-    pace: Pace,
-    touched: wp.array[wp.int32],
-    # Out
-    surface: Surface,
-    begins: wp.array[wp.int32],
-):
+def foresee_places(part: Part, touched: wp.array[wp.int32], begins: wp.array[wp.int32]):
     """Where a body's carriers are, and how far their velocities lead; whether what they touch has changed."""
-    s = start + wp.tid()
-    i = surface.node[s]
+    s = part.start + wp.tid()
+    i = part.nodes.node[s]
     if i < 0:
         return
-    home = load_node(rest, i)
-    surface.rest[s] = home
-    surface.x[s] = home + load_node(u, i)
-    surface.d[s] = float(pace.seconds[DT]) * load_node(v, i)
+    home = load_node(part.dynamics.rest, i)
+    part.nodes.rest[s] = home
+    part.nodes.x[s] = home + load_node(part.dynamics.u, i)
+    part.nodes.d[s] = float(part.pace.seconds[DT]) * load_node(part.dynamics.v, i)
     if (touched[i] & CHANGED) != 0:
         begins[0] = 1
 
 
 @wp.kernel(enable_backward=False)
-def note_touched(
-    # In
-    start: int,
-    offset: int,
-    surface: Surface,
-    # In and out
-    marked: wp.array[wp.int32],
-    touched: wp.array[wp.int32],
-):
-    """What the carriers of a body, from ``offset`` on, have touched in the step; none is marked afterwards."""
-    s = start + wp.tid()
-    i = surface.node[s]
-    now = marked[offset + s]
-    marked[offset + s] = 0
+def note_touched(part: Part, marked: wp.array[wp.int32], touched: wp.array[wp.int32]):
+    """What the carriers of a body have touched in the step; none is marked afterwards."""
+    s = part.start + wp.tid()
+    i = part.nodes.node[s]
+    now = marked[part.shift + s]
+    marked[part.shift + s] = 0
     if i < 0:
         return
     touched[i] = now | wp.where(now != (touched[i] & (CHANGED - 1)), CHANGED, 0)

@@ -3,11 +3,20 @@
 import warp as wp
 
 from .bearing import is_borne
-from .closest import deepest_on_triangle, on_triangle, point_of, segment_to_triangle
 from .law import LOST, Law, across, allowed, held_back, settled
 from .motion import Motions, Surface
 from .rows import Rows
-from .shapes import CAPSULE, SPHERE, Shapes, carried, distance_to
+from .shapes import (
+    CAPSULE,
+    SPHERE,
+    Shapes,
+    carried,
+    deepest_on_triangle,
+    distance_to,
+    on_triangle,
+    point_of,
+    segment_to_triangle,
+)
 
 wp.set_module_options({"enable_backward": False})
 
@@ -43,6 +52,20 @@ def forget_place(r: int, acted: int, was: wp.vec3, rows: Rows):
 
 
 @wp.func
+def begin_row(r: int, was: wp.vec3, part: float, rows: Rows):
+    """Begin a row that has been located with a part of the push of the last step. Friction begins with all of it:
+    otherwise the slip that restores the rest would accumulate."""
+    n = rows.normal[r]
+    push = wp.max(wp.dot(was, n), 0.0)
+    force = wp.vec3()
+    if push > 0.0:
+        force = (part * push) * n + held_back(across(was, n), push, rows.friction[r])
+    rows.force[r] = force
+    rows.more[r] = wp.vec3()
+    rows.acts[r] = WAITS
+
+
+@wp.func
 def begin_place(r: int, dt: float, rigid: Rigid):
     """Find where an obstacle is in this step, and the force with which it begins: that of the last step.
 
@@ -74,16 +97,10 @@ def begin_place(r: int, dt: float, rigid: Rigid):
     if anchor[3] > 0.0:
         held = wp.transform_point(now, wp.vec3(anchor[0], anchor[1], anchor[2]))
         moved -= settled(rigid.law, dt) * across(x - held, n)
-    rows.acts[r] = WAITS
     rows.normal[r] = n
     rows.gap[r] = gap
     rows.moved[r] = moved
-    rows.more[r] = wp.vec3()
-    push = wp.max(wp.dot(was, n), 0.0)
-    force = wp.vec3()
-    if push > 0.0:
-        force = push * n + held_back(across(was, n), push, rows.friction[r])
-    rows.force[r] = force
+    begin_row(r, was, 1.0, rows)
     return True
 
 
@@ -224,14 +241,11 @@ def find_touch(r: int, rigid: Rigid):
     rows.gap[r] = gap
     rows.friction[r] = friction
     rows.moved[r] = carried(pose, later, point_of(w, a, b, c))
-    was_push = wp.max(wp.dot(was, n), 0.0)
-    push = was_push
+    part = float(1.0)
     # Beside corners that touch, too, it would hold these off; and where nodes bear places, other places.
     for k in range(3):
         at = rigid.anchors[o * rigid.surface.node.shape[0] + corners[k]]
         if at[3] > 0.0 or is_borne(corners[k], rigid.surface):
-            push = rigid.surface.warmth[t] * was_push
-    # Friction begins with all of it, because the slip that restores a part would accumulate.
-    if push > 0.0:
-        rows.force[r] = push * n + held_back(across(was, n), was_push, friction)
+            part = rigid.surface.warmth[t]
+    begin_row(r, was, part, rows)
     return True

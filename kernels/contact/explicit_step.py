@@ -5,11 +5,10 @@ import warp as wp
 from warp_corot.kernels.elements.elements import load_node, store_node
 from warp_corot.kernels.modules import INLINED
 from warp_corot.kernels.stepping.balance import count_constraint
-from warp_corot.kernels.stepping.pace import Pace
 
 from .bearing import place_among, store_borne
 from .mass_split import Sums, take_force
-from .motion import Dynamics, Foreseen, Motions, Surface, force_at, foreseen
+from .motion import Foreseen, Motions, Part, Surface, force_at, foreseen
 from .watch import Watch, begin_obstacle, follow_node, pair_of
 
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": INLINED})
@@ -27,24 +26,20 @@ def begin_step(
     borne: int,
     frames: int,
     obstacles: int,
-    body: Dynamics,
-    pace: Pace,
-    offset: int,
-    bearers: Surface,
+    part: Part,
     motions: Motions,
     world_starts: wp.array[wp.float64],
     watches: int,
     # In and out
     watch: Watch,
     # Out
-    nodes: Surface,
     surface: Surface,
 ):
     """Find the positions of a body's surface nodes and their motion in this step without contact, unless contact
     sleeps; move obstacles.
 
     Args:
-        start, count: The first of the ``nodes``, which are places or bear them, and how many there are.
+        start, count: The first of the carriers, and how many there are.
         borne_start, borne: The first place that nodes bear, and how many of them to find here.
         frames: Number of worlds in which the frame of the watch moves.
         obstacles: Number of obstacles of all worlds to move.
@@ -55,16 +50,17 @@ def begin_step(
         watch.drift[k] = watch.drift[k] + watch.common[k]
     if k < obstacles:
         world, o = pair_of(k, watch)
-        begin_obstacle(world, o, motions, pace, world_starts, offset, watches, watch)
+        begin_obstacle(world, o, motions, part.pace, world_starts, part.offset, watches, watch)
     if watch.awake[0] == 0:
         return
+    nodes = part.nodes
     if k < count:
         s = start + k
         i = nodes.node[s]
         nodes.f[s] = wp.vec3()
         nodes.yielding[s] = 0.0
         if i >= 0:
-            own = foreseen(i, body, pace, offset)
+            own = foreseen(i, part)
             nodes.rest[s] = own.rest
             nodes.x[s] = own.x
             nodes.d[s] = own.d
@@ -80,9 +76,7 @@ def begin_step(
             place = Foreseen()
             # Without branches, so that CUDA loads all at once.
             for m in range(4):
-                i = bearers.node[b[m]]
-                own = foreseen(i, body, pace, offset)
-                place = place_among(place, w[m], own)
+                place = place_among(place, w[m], foreseen(nodes.node[b[m]], part))
             store_borne(s, place, surface)
 
 
@@ -91,23 +85,19 @@ def begin_step(
 
 @wp.func
 def push(
-    i: int,
-    force: wp.vec3,
-    counts: int,
-    pace: Pace,
-    offset: int,
-    body: Dynamics,
-    account: wp.array2d[wp.float64],
-    contact_forces: wp.array[wp.vec4],
+    i: int, force: wp.vec3, counts: int, part: Part, account: wp.array2d[wp.float64], contact_forces: wp.array[wp.vec4]
 ):
     """Add the contact force of a node to its forces, and count its work if ``counts`` says so."""
+    body = part.dynamics
     store_node(contact_forces, i, force)
     if wp.dot(force, force) > 0.0:
         store_node(body.f, i, load_node(body.f, i) + force)
         if counts != 0:
             w = body.inverse_mass[i]
             v = load_node(body.v, i)
-            count_constraint(i, force, force_at(i, body), v, body.damping, body.gravity, w, pace, offset, account)
+            count_constraint(
+                i, force, force_at(i, body), v, body.damping, body.gravity, w, part.pace, part.offset, account
+            )
 
 
 @wp.kernel(enable_backward=False)
@@ -117,18 +107,14 @@ def end_contact(
     count: int,
     place_start: int,
     places: int,
-    shift: int,
     buffer: int,
     grain: float,
-    nodes: Surface,
     surface: Surface,
     counts: int,
-    pace: Pace,
-    offset: int,
+    part: Part,
     # In and out
     sums: Sums,
     watch: Watch,
-    body: Dynamics,
     account: wp.array2d[wp.float64],
     # Out
     contact_forces: wp.array[wp.vec4],
@@ -136,21 +122,21 @@ def end_contact(
     """Add the contact forces to a body's forces, and clear their sums; follow the body's places.
 
     Args:
-        start, count: The first of the ``nodes``, which are places or bear them, and how many there are.
+        start, count: The first of the carriers, and how many there are.
         place_start, places: The first place, and how many of them to follow.
-        shift, buffer: How much larger the numbers of nodes in the sums are, and the buffer of these.
+        buffer: That of the sums.
         counts: Whether the work of contact is counted here.
     """
     k = wp.tid()
     if k < count:
         s = start + k
-        i = nodes.node[s]
+        i = part.nodes.node[s]
         if i >= 0:
             force = wp.vec3()
-            n = s + shift
+            n = s + part.shift
             if watch.awake[0] != 0 and sums.touched[n] != 0:
                 force = take_force(n, buffer, grain, sums)
-            push(i, force, counts, pace, offset, body, account, contact_forces)
+            push(i, force, counts, part, account, contact_forces)
     elif k < count + places and watch.awake[0] != 0:
         # Other threads than those of nodes, so that neither wait for the other.
         s = place_start + k - count

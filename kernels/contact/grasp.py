@@ -10,10 +10,9 @@ import warp as wp
 
 from warp_corot.kernels.elements.elements import add_force, load_node, store_node
 from warp_corot.kernels.modules import INLINED
-from warp_corot.kernels.stepping.pace import Pace
 
 from .law import SETTLING
-from .motion import Dynamics, Motions, foreseen
+from .motion import Motions, Part, foreseen
 from .shapes import carried
 
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": INLINED})
@@ -115,132 +114,110 @@ def add_blocks(of: Attachments, blocks: wp.array[wp.mat33]):
 OPEN, HELD, MISSED = (wp.constant(k) for k in range(3))
 
 
+@wp.struct
+class Grip:
+    """Nodes that a tool holds, [R]: as many in each world."""
+
+    nodes: wp.array[wp.int32]
+    per_world: int
+    tool: int  # its number among the obstacles
+    motions: Motions
+    places: wp.array[wp.vec3]  # in the tool's frame [m]
+    held: wp.array[wp.int32]  # see ``HELD``
+    forces: wp.array[wp.vec3]  # on the nodes [N]
+
+
 @wp.kernel(enable_backward=False)
 def take_hold(
     # In
-    nodes: wp.array[wp.int32],
-    per_world: int,
-    o: int,
     poses: wp.array2d[wp.transform],
     closed: wp.array[wp.int32],
     reach: float,
     rest: wp.array[wp.vec4],
     u: wp.array[wp.vec4],
     # In and out
-    held: wp.array[wp.int32],
-    # Out
-    places: wp.array[wp.vec3],
+    grip: Grip,
 ):
     """Let nodes go where the grasp is open. Where it has just closed, take hold of those within reach of the tool's
     origin, and record their positions in the tool's frame.
     """
     k = wp.tid()
-    world = k / per_world
+    world = k / grip.per_world
     if closed[world] == 0:
-        held[k] = OPEN
-    elif held[k] == OPEN:
-        i = nodes[k]
-        place = wp.transform_point(wp.transform_inverse(poses[world, o]), load_node(rest, i) + load_node(u, i))
-        places[k] = place
-        held[k] = wp.where(wp.length(place) <= reach, HELD, MISSED)
+        grip.held[k] = OPEN
+    elif grip.held[k] == OPEN:
+        i = grip.nodes[k]
+        tool = wp.transform_inverse(poses[world, grip.tool])
+        place = wp.transform_point(tool, load_node(rest, i) + load_node(u, i))
+        grip.places[k] = place
+        grip.held[k] = wp.where(wp.length(place) <= reach, HELD, MISSED)
 
 
 @wp.kernel(enable_backward=False)
-def open_grasps(chosen: wp.array[wp.int32], per_world: int, held: wp.array[wp.int32], forces: wp.array[wp.vec3]):
+def open_grasps(chosen: wp.array[wp.int32], grip: Grip):
     """Let the nodes of chosen worlds go."""
     k = wp.tid()
-    if chosen[k / per_world] != 0:
-        held[k] = OPEN
-        forces[k] = wp.vec3()
+    if chosen[k / grip.per_world] != 0:
+        grip.held[k] = OPEN
+        grip.forces[k] = wp.vec3()
 
 
-@wp.kernel(enable_backward=False)
-def hold_in_tool(
-    # In
-    nodes: wp.array[wp.int32],
-    per_world: int,
-    o: int,
-    motions: Motions,
-    places: wp.array[wp.vec3],
-    held: wp.array[wp.int32],
-    stiffness: float,
-    pace: Pace,
-    offset: int,
-    # In and out
-    body: Dynamics,
-    contact_forces: wp.array[wp.vec4],
-    # Out
-    forces: wp.array[wp.vec3],
-):
-    """Find the forces that move nodes with the tool by the end of the step. If ``stiffness`` [N/m] is positive,
-    implicit springs pull the nodes there instead.
-    """
-    k = wp.tid()
-    i = nodes[k]
-    forces[k] = wp.vec3()
-    if body.inverse_mass[i] == 0.0 or held[k] != HELD:
-        return
-    world = k / per_world
-    own = foreseen(i, body, pace, offset)
-    now = motions.now[world, o]
-    way = carried(now, motions.later[world, o], own.x) - own.d
-    off = wp.transform_point(now, places[k]) - own.x
-    force = (way + SETTLING * off) / own.yielding
-    if stiffness > 0.0:
-        force = (stiffness / (1.0 + stiffness * own.yielding)) * (way + off)
-    forces[k] = force
-    store_node(body.f, i, load_node(body.f, i) + force)
+@wp.func
+def add_contact_force(i: int, force: wp.vec3, contact_forces: wp.array[wp.vec4]):
     store_node(contact_forces, i, load_node(contact_forces, i) + force)
 
 
 @wp.kernel(enable_backward=False)
-def aim(
-    # In
-    nodes: wp.array[wp.int32],
-    per_world: int,
-    o: int,
-    motions: Motions,
-    places: wp.array[wp.vec3],
-    held: wp.array[wp.int32],
-    is_rigid: int,
-    inverse_mass: wp.array[wp.float32],
-    rest: wp.array[wp.vec4],
-    # In and out
-    of: Attachments,
-):
+def hold_in_tool(grip: Grip, stiffness: float, part: Part, contact_forces: wp.array[wp.vec4]):
+    """Find the forces that move nodes with the tool by the end of the step. If ``stiffness`` [N/m] is positive,
+    implicit springs pull the nodes there instead. Of ``part`` only what moves the body counts.
+    """
+    k = wp.tid()
+    i = grip.nodes[k]
+    body = part.dynamics
+    grip.forces[k] = wp.vec3()
+    if body.inverse_mass[i] == 0.0 or grip.held[k] != HELD:
+        return
+    world = k / grip.per_world
+    own = foreseen(i, part)
+    now = grip.motions.now[world, grip.tool]
+    way = carried(now, grip.motions.later[world, grip.tool], own.x) - own.d
+    off = wp.transform_point(now, grip.places[k]) - own.x
+    force = (way + SETTLING * off) / own.yielding
+    if stiffness > 0.0:
+        force = (stiffness / (1.0 + stiffness * own.yielding)) * (way + off)
+    grip.forces[k] = force
+    store_node(body.f, i, load_node(body.f, i) + force)
+    add_contact_force(i, force, contact_forces)
+
+
+@wp.kernel(enable_backward=False)
+def aim(grip: Grip, is_rigid: int, inverse_mass: wp.array[wp.float32], rest: wp.array[wp.vec4], of: Attachments):
     """Let springs pull held nodes to where the tool will be at the end of an implicit step, from the last force."""
     k = wp.tid()
+    i = grip.nodes[k]
     spring = of.springs[k]
-    spring.count = wp.where(held[k] == HELD and inverse_mass[nodes[k]] > 0.0, 1, 0)
-    spring.target = wp.transform_point(motions.later[k / per_world, o], places[k]) - load_node(rest, nodes[k])
+    spring.count = wp.where(grip.held[k] == HELD and inverse_mass[i] > 0.0, 1, 0)
+    later = grip.motions.later[k / grip.per_world, grip.tool]
+    spring.target = wp.transform_point(later, grip.places[k]) - load_node(rest, i)
     of.springs[k] = spring
     of.multiplier[k] = wp.where(is_rigid != 0, of.force[k], wp.vec3())
 
 
 @wp.kernel(enable_backward=False)
-def add_held_forces(nodes: wp.array[wp.int32], forces: wp.array[wp.vec3], contact_forces: wp.array[wp.vec4]):
+def add_held_forces(grip: Grip, contact_forces: wp.array[wp.vec4]):
     k = wp.tid()
-    i = nodes[k]
-    store_node(contact_forces, i, load_node(contact_forces, i) + forces[k])
+    add_contact_force(grip.nodes[k], grip.forces[k], contact_forces)
 
 
 @wp.kernel(enable_backward=False)
-def sum_held(
-    # In
-    per_world: int,
-    o: int,
-    motions: Motions,
-    places: wp.array[wp.vec3],
-    forces: wp.array[wp.vec3],
-    # Out
-    wrenches: wp.array[wp.spatial_vector],
-):
+def sum_held(grip: Grip, wrenches: wp.array[wp.spatial_vector]):
     """Sum the wrench of the nodes on the tool, about its origin, in a fixed order."""
     world = wp.tid()
     force = wp.vec3d()
     torque = wp.vec3d()
-    turn = wp.transform_get_rotation(motions.later[world, o])
-    for k in range(world * per_world, (world + 1) * per_world):
-        force -= wp.vec3d(forces[k])
-        torque -= wp.vec3d(wp.cross(wp.quat_rotate(turn, places[k]), forces[k]))
+    turn = wp.transform_get_rotation(grip.motions.later[world, grip.tool])
+    for k in range(world * grip.per_world, (world + 1) * grip.per_world):
+        force -= wp.vec3d(grip.forces[k])
+        torque -= wp.vec3d(wp.cross(wp.quat_rotate(turn, grip.places[k]), grip.forces[k]))
     wrenches[world] = wp.spatial_vector(wp.vec3(force), wp.vec3(torque))

@@ -7,14 +7,13 @@ from warp_corot.kernels.modules import WITHOUT_COPIES, unique_kernel
 from warp_corot.kernels.stepping.pace import DT, Pace
 
 from .bearing import Carriers, crowd_at, gone_at, is_borne, is_held_at, left_at, motion_at
-from .closest import Rolling, rolling_of, tilted
 from .explicit_rows import CORNER, SKEWERED, Rigid, near_triangle
 from .implicit_rows import AGAIN, FIRST, MISSING, REPEATED, ImplicitRows, corner_weights, list_row, opened_by
 from .law import QUARTERED, Law, across, held_back, kept_gap, least_gap
 from .locate import locate_facing
 from .motion import Surface
 from .rows import Rows, row_count
-from .shapes import CAPSULE, GROUND, SPHERE, Shapes, carried, distance_to
+from .shapes import CAPSULE, GROUND, SPHERE, Rolling, Shapes, carried, distance_to, rolling_of, tilted
 from .watch import Watch, wake
 
 wp.set_module_options({"enable_backward": False})

@@ -25,10 +25,10 @@ from .bearing import (
     motion_at,
     push_at,
 )
-from .closest import Rolling, share_of_moment, tilted
 from .law import bound_of, spring_state
 from .motion import Surface
 from .rows import Rows, row_count
+from .shapes import Rolling, share_of_moment, tilted
 
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": WITHOUT_COPIES})
 

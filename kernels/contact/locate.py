@@ -3,11 +3,11 @@
 import warp as wp
 
 from .bearing import is_borne
-from .closest import on_segments, on_triangle, point_of
-from .explicit_rows import FORESEEN, WAITS
-from .law import Law, across, held_back
+from .explicit_rows import FORESEEN, WAITS, begin_row
+from .law import Law
 from .motion import Surface
 from .rows import BAND, BAND_AT_REST, BAND_OF_NEIGHBOURS, Rows, triangle_normal
+from .shapes import on_segments, on_triangle, point_of
 
 wp.set_module_options({"enable_backward": False})
 
@@ -373,17 +373,12 @@ def locate_row(row: int, law: Law, surface: Surface, rows: Rows):
         is_near = locate_edge(row, owner - nodes, rows.other[row], surface, rows)
     elif owner >= 0:
         is_near = locate_node(row, owner, rows.other[row], surface, rows)
-    was = rows.force[row]
-    rows.force[row] = wp.vec3()
-    rows.more[row] = wp.vec3()
-    rows.acts[row] = 0
     if not is_near:
         rows.weights[row] = wp.vec4()
+        rows.force[row] = wp.vec3()
+        rows.more[row] = wp.vec3()
+        rows.acts[row] = WAITS
         return False
-    n = rows.normal[row]
-    # Keep all of it: if each step lost a part, surfaces would sink in until the overlap replaces that part, and would
-    # creep.
-    normal_force = wp.max(wp.dot(was, n), 0.0)
-    if normal_force > 0.0:
-        rows.force[row] = normal_force * n + held_back(across(was, n), normal_force, rows.friction[row])
+    # All of it: if each step lost a part, surfaces would sink in until the overlap replaces that part, and would creep.
+    begin_row(row, rows.force[row], 1.0, rows)
     return may_push(row, law, surface, rows)

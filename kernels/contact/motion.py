@@ -52,6 +52,20 @@ class Surface:
 
 
 @wp.struct
+class Part:
+    """The surface of a body in a step. Its carriers are places, or the nodes that bear places."""
+
+    number: int
+    place: int  # its first place
+    start: int  # its first carrier among ``nodes``
+    shift: int  # how much larger the numbers of these are among all carriers; zero: they are places
+    nodes: Surface
+    dynamics: Dynamics
+    pace: Pace
+    offset: int  # the number of the step since the clock was last advanced
+
+
+@wp.struct
 class Motions:
     """The motion of obstacles, [O], or [W, O] with a row for each world."""
 
@@ -89,10 +103,11 @@ def kick_of(pace: Pace, offset: int):
 
 
 @wp.func
-def foreseen(i: int, body: Dynamics, pace: Pace, offset: int):
+def foreseen(i: int, part: Part):
     """The position of a node and its motion in this step without contact, as the step computes it."""
-    dt = float(pace.seconds[DT])
-    kick = kick_of(pace, offset)
+    body = part.dynamics
+    dt = float(part.pace.seconds[DT])
+    kick = kick_of(part.pace, part.offset)
     damped = 1.0 / (1.0 + dt * body.damping)
     w = body.inverse_mass[i]
     velocity = load_node(body.v, i)

@@ -81,11 +81,14 @@ def triangle_normal(surface: Surface, c: wp.vec3i):
 
 
 @wp.kernel(enable_backward=False)
-def keep_rows(watch: Watch, rows: Rows, old: OldRows):
-    """Copy the present rows, because the search overwrites them; a thread for each node and edge."""
+def keep_rows(watch: Watch, rows: Rows, old: OldRows, most: wp.array[wp.int32]):
+    """Copy the present rows, because the search overwrites them; a thread for each node and edge. ``most``: how many
+    there have been, or would have been if there had been room."""
     i = wp.tid()
     if watch.due[0] == 0:
         return
+    if i == 0:
+        most[0] = wp.max(most[0], rows.total[0])
     owners = rows.starts.shape[0]
     old.starts[i] = rows.starts[i]
     old.counts[i] = rows.counts[i]
@@ -102,10 +105,3 @@ def begin_rows(watch: Watch, rows: Rows):
     """There are none."""
     if watch.due[0] != 0:
         rows.total[0] = 0
-
-
-@wp.kernel(enable_backward=False)
-def end_rows(watch: Watch, rows: Rows, most: wp.array[wp.int32]):
-    """How many there are, or would be if there were room."""
-    if watch.due[0] != 0:
-        most[0] = wp.max(most[0], rows.total[0])

@@ -1,17 +1,19 @@
 """The search for nodes and triangles, and for edges, that may come near each other before the next search."""
 
 import functools
+from typing import Any
 
 import warp as wp
 
+from warp_corot.kernels.elements.elements import frame, local_gradient
 from warp_corot.kernels.modules import INLINED, unique_kernel
 from warp_corot.kernels.stepping.threads import lanes_with, of_first_lane, sum_before, synchronize_warp
 
 from .bearing import share_bearers
-from .closest import on_segments, on_triangle, point_of
 from .locate import BORDER, ENDS, FACING, edge_normal, node_faces_at_rest
 from .motion import Surface
 from .rows import BAND, BAND_AT_REST, Meeting, OldRows, Rows
+from .shapes import on_segments, on_triangle, point_of
 from .watch import CRUSHED, PAIRED, Near, Watch, ahead_at, mark
 from .wide_tree import (
     BLUNT,
@@ -494,3 +496,62 @@ def pair_finder(is_wide: bool) -> wp.Kernel:
             row += lanes
 
     return find_pairs
+
+
+# --- inverted elements: signs of loads that a body cannot carry -------------------------------------------------------
+
+#: The surface of elements below this volume ratio ignores contact with its own body.
+FLAT = wp.constant(0.25)
+
+
+@wp.func
+def volume_ratio(elements: Any, t: int, u: wp.array[wp.vec4]):
+    """det F."""
+    q = frame(elements, t)
+    return wp.determinant(q + local_gradient(elements, t, u)) * wp.determinant(q)
+
+
+@functools.cache
+def count_crushed(Elements: type) -> wp.Kernel:
+    """Count elements with det F < 0 among all elements, or among those that are nonzero in ``counted``."""
+
+    @unique_kernel()
+    def count_crushed(elements: Elements, u: wp.array[wp.vec4], counted: wp.array[wp.int32], count: wp.array[wp.int32]):
+        t = wp.tid()
+        if counted.shape[0] > 0 and counted[t] == 0:
+            return
+        if volume_ratio(elements, t, u) < 0.0:
+            wp.atomic_add(count, 0, 1)
+
+    return count_crushed
+
+
+@functools.cache
+def mark_crushed(Elements: type) -> wp.Kernel:
+    """Mark the surface at elements that are inverted or nearly so; ``places`` maps nodes to places, or to places among
+    bearers, [nodes]."""
+
+    @unique_kernel()
+    def mark_crushed(
+        watch: Watch,
+        elements: Elements,
+        u: wp.array[wp.vec4],
+        places: wp.array[wp.int32],
+        are_borne: int,
+        surface: Surface,
+        near: Near,
+    ):
+        t = wp.tid()
+        if watch.due[0] == 0:
+            return
+        if volume_ratio(elements, t, u) < FLAT:
+            nodes = elements.nodes[t]
+            for k in range(4):
+                place = places[nodes[k]]
+                if place >= 0 and are_borne == 0:
+                    wp.atomic_or(near.flags, place, CRUSHED)
+                elif place >= 0:
+                    for m in range(surface.bearing.starts[place], surface.bearing.starts[place + 1]):
+                        wp.atomic_or(near.flags, surface.bearing.places[m], CRUSHED)
+
+    return mark_crushed

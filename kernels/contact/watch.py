@@ -12,7 +12,7 @@ from warp_corot.kernels.elements.elements import load_node
 from warp_corot.kernels.modules import INLINED
 from warp_corot.kernels.stepping.pace import DONE, DT, Pace
 
-from .motion import Motions, Surface, distance_between, move_obstacle
+from .motion import Motions, Part, Surface, distance_between, move_obstacle
 
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": INLINED})
 
@@ -328,10 +328,10 @@ def begin_search(s: int, obstacles: int, surface: Surface, motions: Motions, wat
 
 
 @wp.kernel(enable_backward=False)
-def report_search(watch: Watch, most: wp.array[wp.int32], report: wp.array[wp.float64]):
+def report_search(watch: Watch, total: wp.array[wp.int32], most: wp.array[wp.int32], report: wp.array[wp.float64]):
     """Report to the host the largest number of near pairs, how often an item moved too far, and the number of
     searches."""
-    report[0] = wp.float64(most[0])
+    report[0] = wp.float64(wp.max(most[0], total[0]))
     report[1] = wp.float64(watch.missed[0])
     report[2] = wp.float64(watch.searches[0])
 
@@ -346,13 +346,11 @@ LEAST_CALM = wp.constant(0.5)
 
 
 @wp.func
-def gone_from_search(
-    s: int, i: int, nodes: Surface, is_framed: int, rest: wp.array[wp.vec4], u: wp.array[wp.vec4], watch: Watch
-):
+def gone_from_search(s: int, i: int, is_framed: int, part: Part, watch: Watch):
     """How far a node has moved since the last search, which was in the last step in which contact was awake."""
-    gone = load_node(rest, i) + load_node(u, i) - nodes.x[s]
+    gone = load_node(part.dynamics.rest, i) + load_node(part.dynamics.u, i) - part.nodes.x[s]
     if is_framed != 0:
-        gone -= watch.drift[nodes.world[s]]
+        gone -= watch.drift[part.nodes.world[s]]
     return gone
 
 
@@ -360,49 +358,43 @@ def gone_from_search(
 def rouse(
     # In
     threads: int,
-    start: int,
     count: int,
-    nodes: Surface,
     is_framed: int,
     obstacles: int,
     motions: Motions,
     world_starts: wp.array[wp.float64],
-    pace: Pace,
-    offset: int,
-    rest: wp.array[wp.vec4],
-    u: wp.array[wp.vec4],
-    v: wp.array[wp.vec4],
+    part: Part,
     # In and out
     watch: Watch,
 ):
     """Move obstacles, and wake contact if one of them or a node of a body may move too far in this step.
 
     Args:
-        start, count: The first of the ``nodes``, which are places or bear them, and how many there are.
+        count: Number of the body's carriers.
         is_framed: Whether only motion relative to frames counts.
         obstacles: Number of obstacles of all worlds to move.
     """
     k = wp.tid()
     while k < obstacles:
         world, o = pair_of(k, watch)
-        begin_obstacle(world, o, motions, pace, world_starts, offset, 1, watch)
+        begin_obstacle(world, o, motions, part.pace, world_starts, part.offset, 1, watch)
         k += threads
     if watch.awake[0] != 0:
         return
-    dt = float(pace.seconds[DT])
+    dt = float(part.pace.seconds[DT])
     free = watch.free[0]
     # Before a run nodes may have been moved from outside.
-    counts = offset > 0 or pace.counts[DONE] != watch.published[0]
+    counts = part.offset > 0 or part.pace.counts[DONE] != watch.published[0]
     k = wp.tid()
     while k < count:
-        s = start + k
+        s = part.start + k
         k += threads
-        i = nodes.node[s]
+        i = part.nodes.node[s]
         if i >= 0:
-            gone = gone_from_search(s, i, nodes, is_framed, rest, u, watch)
-            step = dt * load_node(v, i)
+            gone = gone_from_search(s, i, is_framed, part, watch)
+            step = dt * load_node(part.dynamics.v, i)
             if is_framed != 0:
-                step -= watch.common[nodes.world[s]]
+                step -= watch.common[part.nodes.world[s]]
             # Most nodes pass this test, without roots; (a + b)^2 is at most 2 (a^2 + b^2).
             if not (2.0 * (wp.dot(gone, gone) + wp.dot(step, step)) <= watch.skin * watch.skin * free * free):
                 far = wp.length(gone)
@@ -413,26 +405,15 @@ def rouse(
 
 
 @wp.kernel(enable_backward=False)
-def check_sleep(
-    # In
-    start: int,
-    nodes: Surface,
-    is_framed: int,
-    pace: Pace,
-    rest: wp.array[wp.vec4],
-    u: wp.array[wp.vec4],
-    # In and out
-    watch: Watch,
-):
+def check_sleep(is_framed: int, part: Part, watch: Watch):
     """Check after a run whether its last step has moved a node too far."""
     k = wp.tid()
-    i = nodes.node[start + k]
-    if watch.awake[0] == 0 and i >= 0:
-        gone = wp.length(gone_from_search(start + k, i, nodes, is_framed, rest, u, watch))
-        if gone > watch.free[0]:
-            wp.atomic_add(watch.missed, 0, 1)
+    s = part.start + k
+    i = part.nodes.node[s]
+    if watch.awake[0] == 0 and i >= 0 and wp.length(gone_from_search(s, i, is_framed, part, watch)) > watch.free[0]:
+        wp.atomic_add(watch.missed, 0, 1)
     if k == 0:
-        watch.published[0] = pace.counts[DONE]
+        watch.published[0] = part.pace.counts[DONE]
 
 
 @wp.func

@@ -28,8 +28,8 @@ a fraction of the margin, to keep cloth apart.
 
 import warp as wp
 
-from warp_corot.kernels.contact.closest import on_triangle
 from warp_corot.kernels.contact.law import across, held_back
+from warp_corot.kernels.contact.shapes import on_triangle
 
 from .particles import TOO_MANY_PAIRS, Bodies, Particles, is_fixed, mark
 from .rows import (

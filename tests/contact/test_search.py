@@ -87,7 +87,7 @@ def watched(sim, steps, itself):
 def test_the_search_finds_all_pairs_within_reach(device, rng, itself, monkeypatch):
     """Compared with every pair, while two blocks in two worlds are thrown at one another, turn and bounce; the trees of
     boxes are built again at every other step."""
-    monkeypatch.setattr("warp_corot.contact.pairs.REBUILT", 2)
+    monkeypatch.setattr("warp_corot.contact.search.REBUILT", 2)
     low, high = block(device, 0.0, worlds=2), block(device, 0.0202, cells=(1, 1, 1), at=0.008, worlds=2)
     sim = wc.Simulation([low, high], contact=wc.Contact(self_contact=itself), gravity=(0.0, 0.0, 0.0), integrator=CALM)
     for body, toward in ((low, 0.5), (high, -1.0)):

@@ -18,7 +18,7 @@ from .skin import Skin
 if TYPE_CHECKING:
     from .contacts import Contacts
     from .obstacles import RigidForces
-    from .pairs import Pairs
+    from .search import Pairs
     from .surface import ContactSurface
 
 #: Points that are nearer each other at rest than this fraction of the surface's size are the same.

@@ -11,8 +11,10 @@ import warp as wp
 
 from warp_corot.inputs.cpu_threads import Regions, launch, team_of
 from warp_corot.kernels.contact import bearing, motion, sums
+from warp_corot.kernels.contact.explicit_rows import Rigid
 from warp_corot.kernels.contact.explicit_step import BLOCK, begin_step, end_contact
 from warp_corot.kernels.contact.law import SETTLING, Law
+from warp_corot.kernels.contact.motion import Part
 from warp_corot.solvers.halo import ALONE
 from warp_corot.solvers.system import System
 
@@ -21,13 +23,11 @@ from .implicit import ImplicitContact
 from .mass_split import Approach, MassSplit
 from .obstacles import Obstacles, RigidForces
 from .options import SURFACE, Contact, may_meet
-from .pairs import Pairs, smallest_size
-from .search import Search, Sleep
+from .reading import OVERLAP, warn_of_crushed, warn_of_overlaps
+from .search import Pairs, Search, Sleep, smallest_size
 from .skin import has_own_surface
-from .surface import ContactSurface
+from .surface import ContactSurface, SurfaceHalo, WholeSurface
 from .tool import Obstacle
-from .warned import OVERLAP, warn_of_crushed, warn_of_overlaps
-from .whole_surface import SurfaceHalo, WholeSurface
 
 #: Gaps that come from rounding, in roundings of the largest coordinate.
 ROUNDINGS = 16.0
@@ -91,7 +91,7 @@ class Contacts:
         made = WholeSurface(system, **kind) if is_whole else ContactSurface(system.bodies, **kind)
         self.surface: ContactSurface = made
         #: The exchange with ranks that have other places of the surface.
-        self._shared = SurfaceHalo(ALONE if is_whole else system.ranks, self.surface)
+        self.shared = SurfaceHalo(ALONE if is_whole else system.ranks, self.surface)
         self.law = self._law(stable_dt)
         self.search = Search(self.surface, self.obstacles, self.smallest, branches=system.ranks.is_alone)
         #: Contact between soft surfaces; None if they cannot touch one another.
@@ -100,18 +100,17 @@ class Contacts:
         if self.obstacles.count:
             self.rigid = RigidForces(self.surface, self.obstacles, self.search, self.law)
         team = team_of(max(body.discretization.team.parts for body in system.bodies))
-        self._regions = Regions(team, self.device)
-        given = (self.surface, self.search, self.law, system.pace.arrays, self._shared, self.rigid, self.pairs, team)
+        #: The threads of the CPU that share the surface.
+        self.regions = Regions(team, self.device)
         #: The forces of explicit steps.
-        self.split = MassSplit(*given)
+        self.split = MassSplit(self)
         self._is_explicit = False
         #: Steps that visit only what may touch obstacles; None on CUDA, over ranks, and if soft surfaces may touch.
         self.approach: Approach | None = None
         if self.device.is_cpu and self.rigid is not None and self.pairs is None and system.ranks.is_alone:
-            things = (system, made, self.search, self.obstacles, self.law, self.rigid, self.split)
-            self.approach = Approach(*things, self._regions)
+            self.approach = Approach(self, self.rigid)
         #: Steps while nothing is near; None on the CPU, where nothing can be left out, and without searches.
-        self.sleep = Sleep(system, made, self.obstacles, self.search) if self.search.can_sleep else None
+        self.sleep = Sleep(self) if self.search.can_sleep else None
         self._revision = 0
         self._is_looked_at = self._has_crushed = False
         self._make_arrays()
@@ -214,11 +213,9 @@ class Contacts:
             if part.bearers and len(system.constraints) > 1:
                 # Grasps add to the forces of nodes that bear nothing, too.
                 state.contact_forces.zero_()
-            start, count, arrays = self.surface.nodes_of(k)
-            inputs: list = [self.split.first(k) - start, self.split.buffer, self.law.grain, arrays, surface.arrays]
-            inputs += [int(counts), system.pace.arrays, offset]
-            outputs = [self.split.sums, self.search.watch, system.dynamics(body, damping)]
-            outputs += [accounts[0] if counts else None, state.contact_forces]
+            start, count, _arrays = surface.nodes_of(k)
+            inputs = [self.split.buffer, self.law.grain, surface.arrays, int(counts), self.part(k, offset, damping)]
+            outputs = [self.split.sums, self.search.watch, accounts[0] if counts else None, state.contact_forces]
             ranges = (start, count), (part.start, self._count(k) if follows else 0)
             self._launch_ranges(end_contact, ranges, inputs, outputs, (k, offset))
         if surface.is_whole:
@@ -240,7 +237,7 @@ class Contacts:
         """Contact in implicit steps, if anything may touch."""
         if self.rigid is None and self.pairs is None:
             return None
-        return ImplicitContact(self.system, self.surface, self.obstacles, self.law, self.rigid, self.pairs)
+        return ImplicitContact(self)
 
     def measure(self) -> None:
         thinnest = self.obstacles.thinnest
@@ -263,14 +260,14 @@ class Contacts:
         if self.rigid is not None:
             forces = self.rigid.launch_totals()
             for number in range(obstacles.count if self.rigid.have_edges else 0):
-                self._shared.clear(forces[number])
+                self.shared.clear(forces[number])
             threads = self._parts.shape[2] * self._lanes
             for part in surface.parts:
                 inputs = [part.start, part.nodes, self._lanes, threads, surface.arrays, obstacles.motions, forces]
                 wp.launch(
                     sums.sum_wrenches, (*obstacles.wrenches.shape, threads), inputs, [self._parts], device=self.device
                 )
-            self._shared.ranks.sum(self._parts)
+            self.shared.ranks.sum(self._parts)
             wp.launch(
                 sums.fold_wrenches, obstacles.wrenches.shape, [self._parts], [obstacles.wrenches], device=self.device
             )
@@ -280,7 +277,7 @@ class Contacts:
             if self.approach is not None:
                 self.approach.launch_completion()
         self._launch(sums.node_pressures, surface.count, [surface.arrays], [self._pressures])
-        self._shared.exchange(self._pressures)
+        self.shared.exchange(self._pressures)
         for k, part in enumerate(surface.parts):
             inputs = [part.triangle_start, surface.arrays, self._pressures]
             outputs = [self._triangle_pressures[k]]
@@ -366,32 +363,30 @@ class Contacts:
         world_starts = system.bodies[0].conditions.world_starts
         # On CUDA a launch takes longer than the work: places find the nodes that bear them by themselves.
         finds_borne = self.device.is_cuda and not surface.is_whole
-        for k, body in enumerate(system.bodies):
-            part = surface.parts[k]
-            start, count, arrays = self.surface.nodes_of(k)
+        for k, part in enumerate(surface.parts):
+            start, count, _arrays = surface.nodes_of(k)
             borne = self._count(k) if part.bearers and finds_borne else 0
             moved = system.worlds * obstacles.count if moves and k == 0 else 0
-            inputs = [system.dynamics(body, damping), system.pace.arrays, offset, surface.bearers]
             frames = system.worlds if begins and k == 0 else 0
-            inputs += [obstacles.motions, world_starts, int(moves)]
-            outputs, ranges = [self.search.watch, arrays, surface.arrays], ((start, count), (part.start, borne))
+            inputs = [self.part(k, offset, damping), obstacles.motions, world_starts, int(moves)]
+            outputs, ranges = [self.search.watch, surface.arrays], ((start, count), (part.start, borne))
             key = (k, offset, begins, moves)
             self._launch_ranges(begin_step, ranges, inputs, outputs, key, once=(frames, moved))
         if isinstance(surface, WholeSurface):
             surface.complete()
         elif self.rigid is not None and self.rigid.have_edges:
-            self._shared.exchange(surface.arrays.d)
+            self.shared.exchange(surface.arrays.d)
         for k, part in enumerate(surface.parts):
             if part.bearers and not finds_borne:
                 inputs = [part.start, surface.bearers, surface.arrays]
-                self._regions.launch_from(bearing.place_borne, self._count(k), inputs, [], k)
+                self.regions.launch_from(bearing.place_borne, self._count(k), inputs, [], k)
 
     def _make_arrays(self) -> None:
         surface, device = self.surface, self.device
         count, obstacles = surface.count, self.obstacles.count
         self._lanes = 1 if device.is_cpu else WARP
         # Halo add these arrays up, so they must be of one size.
-        most = int(self._shared.ranks.max(float(max(part.nodes for part in surface.parts))))
+        most = int(self.shared.ranks.max(float(max(part.nodes for part in surface.parts))))
         warps = 1 if device.is_cpu else max(min(most // WARP, MOST_WARPS), 1)
         self._parts = wp.zeros((obstacles, self.system.worlds, warps), dtype=wp.spatial_vectord, device=device)
         self._pressures = wp.zeros(count, dtype=wp.vec3, device=device)
@@ -411,6 +406,24 @@ class Contacts:
             body.state.contact_surface = part.skin.own
             body.state.rebound_contact_surface = self.surface.rebound(body)
 
+    def part(self, k: int, offset: int = 0, damping: float = 0.0) -> Part:
+        """The surface of the k-th body in a step, as a struct for kernels."""
+        part, of = Part(), self.surface.parts[k]
+        part.number, part.place, part.shift = k, of.start, self.surface.count if of.bearers else 0
+        part.start, _count, part.nodes = self.surface.nodes_of(k)
+        part.dynamics = self.system.dynamics(self.system.bodies[k], damping)
+        part.pace, part.offset = self.system.pace.arrays, offset
+        return part
+
+    @property
+    def rigid_arrays(self) -> Rigid:
+        """Contact with obstacles as a struct for kernels; without them only the surfaces and the law."""
+        if self.rigid is not None:
+            return self.rigid.arrays
+        made = Rigid()
+        made.surface, made.law = self.surface.arrays, self.law
+        return made
+
     def _count(self, k: int) -> int:
         """Number of places of a body in all worlds."""
         return self.system.worlds * self.surface.parts[k].nodes
@@ -426,7 +439,7 @@ class Contacts:
     ) -> None:
         """Launch a kernel in parts, with a thread for each item of all ranges. Its first arguments are the beginning
         and the length of each range, and then numbers of things that the first part does ``once``."""
-        bounds = [self._regions.team.bounds(count) for _, count in ranges]
+        bounds = [self.regions.team.bounds(count) for _, count in ranges]
 
         def phase(part: int) -> None:
             own = [
@@ -436,7 +449,7 @@ class Contacts:
             dim = max(sum(count for _, count in own), 0, *first)
             launch(kernel, dim, [*chain(*own), *first, *inputs], outputs, device=self.device, block_dim=BLOCK)
 
-        self._regions.launch((kernel, *key), phase)
+        self.regions.launch((kernel, *key), phase)
 
     def _launch(self, kernel: wp.Kernel, dim: int, inputs: list, outputs: list) -> None:
         wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)

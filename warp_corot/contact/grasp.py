@@ -15,6 +15,7 @@ from warp_corot.body.soft_body import SoftBody
 from warp_corot.errors import InputError, StabilityWarning, depth_of_user
 from warp_corot.inputs.checks import checked_number, shown
 from warp_corot.kernels.contact import grasp as kernels
+from warp_corot.kernels.contact.motion import Part
 from warp_corot.mesh import TetForest
 from warp_corot.solvers.system import Constraint
 
@@ -222,32 +223,30 @@ class Grasp(Attachments, Constraint):
             return
         if self.closed is not None:
             self._take_hold(self._obstacles.motions.now)
-        inputs = [self._nodes, self._per_world, self._number, self._obstacles.motions, self._places, self._held]
-        inputs += [self._stiffness, self._system.pace.arrays, offset]
-        outputs = [self._system.dynamics(self.body, damping), self.body.state.contact_forces, self.arrays.force]
-        self._launch(kernels.hold_in_tool, inputs, outputs)
+        part = Part()
+        part.dynamics, part.pace = self._system.dynamics(self.body, damping), self._system.pace.arrays
+        part.offset = offset
+        self._launch(kernels.hold_in_tool, [self._grip, self._stiffness, part], [self.body.state.contact_forces])
 
     def launch_begin(self) -> None:
         """Launch the beginning of an implicit step."""
         if self.closed is not None:
             self._take_hold(self._obstacles.motions.now)
-        inputs = [self._nodes, self._per_world, self._number, self._obstacles.motions, self._places, self._held]
-        inputs += [int(self.stiffness is None), self.body.conditions.inverse_mass, self.body.state.rest]
-        self._launch(kernels.aim, inputs, [self.arrays])
+        inputs = [int(self.stiffness is None), self.body.conditions.inverse_mass, self.body.state.rest]
+        self._launch(kernels.aim, [self._grip, *inputs], [self.arrays])
 
     def launch_held(self, body: SoftBody) -> None:
         """Launch the addition of its forces at the end of an implicit step to those of contact."""
         if body is self.body:
-            self._launch(kernels.add_held_forces, [self._nodes, self.arrays.force], [body.state.contact_forces])
+            self._launch(kernels.add_held_forces, [self._grip], [body.state.contact_forces])
 
     def publish(self) -> None:
-        inputs = [self._per_world, self._number, self._obstacles.motions, self._places, self.arrays.force]
-        wp.launch(kernels.sum_held, self.body.worlds, inputs, [self._wrenches], device=self.device)
+        wp.launch(kernels.sum_held, self.body.worlds, [self._grip], [self._wrenches], device=self.device)
 
     def reset(self, chosen: wp.array) -> None:
         """Open the grasp in chosen worlds, if it opens at all; otherwise it goes on holding."""
         if self.closed is not None:
-            self._launch(kernels.open_grasps, [chosen, self._per_world], [self._held, self.arrays.force])
+            self._launch(kernels.open_grasps, [chosen], [self._grip])
 
     # --- pieces ----------------------------------------------------------------------------------------------------
 
@@ -258,8 +257,17 @@ class Grasp(Attachments, Constraint):
     def _take_hold(self, poses: wp.array) -> None:
         """Launch the opening and closing, with the tools in these poses, [worlds, O]."""
         state = self.body.state
-        inputs = [self._nodes, self._per_world, self._number, poses, self._closed, self._reach]
-        self._launch(kernels.take_hold, [*inputs, state.rest, state.displacements], [self._held, self._places])
+        inputs = [poses, self._closed, self._reach, state.rest, state.displacements]
+        self._launch(kernels.take_hold, inputs, [self._grip])
+
+    @property
+    def _grip(self) -> kernels.Grip:
+        """The nodes as a struct for kernels."""
+        grip = kernels.Grip()
+        grip.nodes, grip.per_world, grip.tool = self._nodes, self._per_world, self._number
+        grip.motions, grip.places, grip.held = self._obstacles.motions, self._places, self._held
+        grip.forces = self.arrays.force
+        return grip
 
     def _rigid_stiffness(self) -> float:
         """The stiffness of a node that is held rigidly in implicit steps [N/m]."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import warp as wp
@@ -11,17 +11,14 @@ import warp as wp
 from warp_corot.kernels.contact import bearing
 from warp_corot.kernels.contact import implicit_location as location
 from warp_corot.kernels.contact import implicit_rows as kernels
-from warp_corot.kernels.contact.closest import Rolling
-from warp_corot.kernels.contact.law import Law
 from warp_corot.kernels.contact.motion import Surface
 from warp_corot.kernels.contact.rows import Rows
+from warp_corot.kernels.contact.shapes import Rolling
 from warp_corot.kernels.implicit.assembled import Couplings
 from warp_corot.solvers.implicit.operator import Springs
-from warp_corot.solvers.system import System
 
-from .obstacles import Obstacles, RigidForces
-from .pairs import Pairs
-from .surface import ContactSurface
+if TYPE_CHECKING:
+    from .contacts import Contacts
 
 #: Types of the arrays of ``ImplicitRows``: of all rows, of triangles, of pairs, and of one number.
 OF_ROWS = {
@@ -43,12 +40,7 @@ class ImplicitContact:
     """The contact of all bodies with obstacles and with one another in implicit steps.
 
     Args:
-        system: The bodies.
-        surface: Their surfaces.
-        obstacles: The obstacles.
-        law: How fast things that overlap are pushed apart.
-        rigid: Forces of obstacles; None without.
-        pairs: Soft surfaces against one another; None if they cannot touch.
+        contacts: The contact.
 
     Attributes:
         couples: Whether bodies may touch one another, so that all of them are solved for together.
@@ -58,17 +50,9 @@ class ImplicitContact:
         total: Number of pairs, int32 [1].
     """
 
-    def __init__(
-        self,
-        system: System,
-        surface: ContactSurface,
-        obstacles: Obstacles,
-        law: Law,
-        rigid: RigidForces | None,
-        pairs: Pairs | None,
-    ):
-        self._system, self._surface, self._obstacles, self._law = system, surface, obstacles, law
-        self._rigid, self._pairs, self.device = rigid, pairs, system.device
+    def __init__(self, contacts: Contacts):
+        self._of, self._rigid, self._pairs, self._law = contacts, contacts.rigid, contacts.pairs, contacts.law
+        self._system, self._surface, self.device = contacts.system, contacts.surface, contacts.device
         self.couples = self._pairs is not None
         self.changed, self._searches, self._none = (wp.zeros(1, dtype=wp.int32, device=self.device) for _ in range(3))
         self._rows = kernels.ImplicitRows()
@@ -78,7 +62,7 @@ class ImplicitContact:
         self.locates, self.solves = self._rows.locates, self._rows.solves
         self._made: tuple[int, int] = (-1, -1)
         #: The first entry of each body in vectors of all bodies.
-        self._firsts = [0] * len(system.bodies)
+        self._firsts = [0] * len(self._system.bodies)
         self.prepare()
 
     @property
@@ -88,7 +72,7 @@ class ImplicitContact:
     def prepare(self) -> None:
         """Update to the present surfaces and the room for pairs; not while launches are recorded."""
         surface, rows = self._surface, self._rows
-        obstacles = self._obstacles.count
+        obstacles = self._of.obstacles.count
         room = 0 if self._pairs is None else self._pairs.room
         if (surface.revision, room) == self._made:
             return
@@ -111,7 +95,7 @@ class ImplicitContact:
         rows.carriers = self._carriers
         self._marked, self._added = self._zeros(carriers, wp.int32), self._zeros(surface.count, wp.vec3)
         # Places of their own, where pairs are located: obstacles find the places where they are when a step begins.
-        self._located: Any = Surface()
+        self._located = cast(Any, Surface())
         self._located.assign(surface.arrays)
         self._located.x = self._zeros(surface.count if room else 0, wp.vec3)
         self._stiffness = self._zeros(surface.count, wp.mat33)
@@ -154,12 +138,8 @@ class ImplicitContact:
             touched: What the nodes of each body have touched, int32 [worlds * nodes]; see ``launch_touched``.
             begins: Nonzero afterwards if so, int32 [1].
         """
-        pace = self._system.pace.arrays
-        for k, body in enumerate(self._system.bodies):
-            start, _, count, own = self._nodes_of(k)
-            state = body.state
-            inputs = [start, state.rest, state.displacements, state.velocities, pace, touched[k]]
-            wp.launch(bearing.foresee_places, count, inputs, [own, begins], device=self.device)
+        for k, array in enumerate(touched):
+            self._on_carriers(k, bearing.foresee_places, [array, begins])
             self._launch_places(k)
         if self._rigid is not None:
             inputs = [self._rigid.arrays, self._carriers]
@@ -171,11 +151,10 @@ class ImplicitContact:
 
     def launch_touched(self, touched: Sequence[wp.array]) -> None:
         """Launch the record, after a step, of what the nodes of each body have touched."""
-        inputs = [max(self._obstacles.count, 1), self._rows, self._marked]
+        inputs = [max(self._of.obstacles.count, 1), self._rows, self._marked]
         self._on_rows(kernels.mark_acting, inputs)
         for k, array in enumerate(touched):
-            start, offset, count, own = self._nodes_of(k)
-            wp.launch(bearing.note_touched, count, [start, offset, own, self._marked, array], device=self.device)
+            self._on_carriers(k, bearing.note_touched, [self._marked, array])
 
     def launch_begin(self, k: int, first: int, blocks: wp.array, increment: wp.array, guess: wp.array) -> None:
         """Launch the state of the k-th body at the beginning of a step.
@@ -187,11 +166,8 @@ class ImplicitContact:
             increment: How far held nodes have gone in the step [m], vec4.
             guess: How far free nodes may go [m], vec4.
         """
-        body, self._firsts[k] = self._system.bodies[k], first
-        start, offset, count, own = self._nodes_of(k)
-        inputs = [start, offset, first, body.conditions.inverse_mass, blocks]
-        inputs += [body.state.rest, body.state.displacements, increment, guess]
-        wp.launch(bearing.begin_carriers, count, inputs, [own, self._carriers], device=self.device)
+        self._firsts[k] = first
+        self._on_carriers(k, bearing.begin_carriers, [first, blocks, increment, guess, self._carriers])
         self._launch_places(k)
 
     def launch_first(self, offset: int, d: wp.array) -> None:
@@ -285,9 +261,7 @@ class ImplicitContact:
         self._launch(kernels.end_rows, self._length, [self._rows, beside, self._pair_rows, self._added])
         wp.launch(kernels.end_places, surface.count, [d, self._added, self._carriers], device=self.device)
         for k, body in enumerate(self._system.bodies):
-            start, _, count, own = self._nodes_of(k)
-            inputs = [start, int(surface.parts[k].bearers > 0), own, surface.arrays]
-            wp.launch(bearing.end_carriers, count, inputs, [body.state.contact_forces], device=self.device)
+            self._on_carriers(k, bearing.end_carriers, [surface.arrays, body.state.contact_forces])
         if self._pairs is not None:
             self._pairs.search.launch_after()
 
@@ -325,13 +299,9 @@ class ImplicitContact:
     def _pair_rows(self) -> Rows:
         return Rows() if self._pairs is None else self._pairs.rows
 
-    def _nodes_of(self, k: int) -> tuple[int, int, int, Surface]:
-        """The carriers of a body as nodes: the first, the number of carriers before these nodes, how many there are,
-        and the struct of all these nodes."""
-        surface, part = self._surface, self._surface.parts[k]
-        if part.bearers:
-            return part.bearer_start, surface.count, surface.worlds * part.bearers, surface.bearers
-        return part.start, 0, self.places_of(k), surface.arrays
+    def _on_carriers(self, k: int, kernel: wp.Kernel, inputs: list) -> None:
+        """Launch a kernel over the carriers of a body."""
+        wp.launch(kernel, self._surface.nodes_of(k)[1], [self._of.part(k), *inputs], device=self.device)
 
     def _launch_places(self, k: int) -> None:
         """Launch the positions and motions of the places between nodes of a body, from those of the nodes."""

@@ -14,13 +14,12 @@ from warp_corot.kernels.contact import motion as kernels
 from warp_corot.kernels.contact import sums
 from warp_corot.kernels.contact.explicit_rows import Rigid
 from warp_corot.kernels.contact.law import Law
-from warp_corot.kernels.contact.rows import Rows
 from warp_corot.kernels.contact.shapes import Shapes
 from warp_corot.kernels.contact.sums import measure_gaps
 from warp_corot.kernels.contact.watch import Watch, move_obstacles
 from warp_corot.solvers.system import System
 
-from .search import Search
+from .search import Search, rows_of
 from .shapes import Ground, Shape, SignedDistance, TriangleMesh
 from .surface import ContactSurface
 from .tool import Obstacle, Tool, as_tool
@@ -29,13 +28,6 @@ from .tool import Obstacle, Tool, as_tool
 LARGEST_SHARE = 0.5
 #: A tool that has to catch up with its keyframes moves at this many times their highest speed.
 CATCHING_UP = 2.0
-#: What obstacles' rows and pairs have, by type.
-ROWS = {
-    wp.int32: ("acts",),
-    wp.float32: ("gap", "friction"),
-    wp.vec3: ("normal", "moved", "force", "more"),
-    wp.vec4: ("weights",),
-}
 
 
 def have_edges(obstacles: Sequence[Obstacle]) -> bool:
@@ -399,12 +391,3 @@ def split_rows(rows: npt.NDArray[Any], obstacles: int, places: int) -> tuple[npt
     at = obstacles * places
     count = (len(rows) - at) // obstacles
     return rows[:at].reshape(obstacles, places, *rows.shape[1:]), rows[at:].reshape(obstacles, count, *rows.shape[1:])
-
-
-def rows_of(count: int, device: wp.Device) -> Rows:
-    """A table of so many rows, without what only pairs have."""
-    rows = Rows()
-    for dtype, names in ROWS.items():
-        for name in names:
-            setattr(rows, name, wp.zeros(count, dtype=dtype, device=device))
-    return rows

@@ -1,4 +1,4 @@
-"""The search for nearby surfaces, repeated once something has moved far enough since the last one."""
+"""The search for nearby surfaces, repeated once something has moved far enough since the last one; and nearby pairs."""
 
 from __future__ import annotations
 
@@ -6,19 +6,24 @@ from collections.abc import Callable
 from functools import partial
 from typing import TYPE_CHECKING
 
+import numpy as np
 import warp as wp
 
 from warp_corot.errors import UnstableError
-from warp_corot.kernels.contact import beside
+from warp_corot.kernels.contact import beside, wide_tree
 from warp_corot.kernels.contact import watch as kernels
 from warp_corot.kernels.contact.explicit_rows import FORESEEN, Rigid
+from warp_corot.kernels.contact.rows import Meeting, OldRows, Rows, begin_rows, keep_rows
+from warp_corot.kernels.contact.search import LANES as WARP
+from warp_corot.kernels.contact.search import mark_crushed, pair_finder
+from warp_corot.solvers.halo import ALONE, Halo
 from warp_corot.solvers.pace import Mapped
 
-from .surface import ContactSurface
+from .options import Contact
+from .surface import ContactSurface, planted
 
 if TYPE_CHECKING:
-    from warp_corot.solvers.system import System
-
+    from .contacts import Contacts
     from .obstacles import Obstacles, RigidForces
 
 #: The least motion that is reserved for anything between two searches, as a fraction of the smallest element's size,
@@ -52,7 +57,7 @@ class Search:
         near: The nodes that have something near them.
         rigid: Forces of obstacles, if there are any.
         find_pairs: The launch of the search for pairs of soft surfaces, if they may touch.
-        most: The largest number of pairs so far, int32 [1].
+        total, most: The number of pairs, and the largest before the last search, int32 [1].
         farthest: The largest value of the least motion that is reserved [m].
     """
 
@@ -62,7 +67,7 @@ class Search:
         self.rigid: RigidForces | None = None
         self.find_pairs: Callable[[], None] | None = None
         self._report = Mapped(3, self.device)
-        self.most = wp.zeros(1, dtype=wp.int32, device=self.device)
+        self.total, self.most = (wp.zeros(1, dtype=wp.int32, device=self.device) for _ in range(2))
         watch, device = kernels.Watch(), self.device
         watch.least = wp.full(1, LEAST * size, dtype=wp.float32, device=device)
         watch.fastest = wp.zeros(1 + surface.worlds, dtype=wp.float32, device=device)
@@ -207,7 +212,7 @@ class Search:
 
     def launch_report(self) -> None:
         """Launch the report to the host after a run."""
-        wp.launch(kernels.report_search, 1, [self.watch, self.most, self._report.array], device=self.device)
+        wp.launch(kernels.report_search, 1, [self.watch, self.total, self.most, self._report.array], device=self.device)
 
     def _search(self, is_framed: bool, sleeps: bool) -> None:
         asks = 0 if not is_framed else 2 if len(self.surface.parts) == 1 else 1
@@ -242,20 +247,13 @@ class Sleep:
     """What steps of awake and of sleeping contact launch.
 
     Args:
-        system: The bodies.
-        surface: Their surfaces.
-        obstacles: The obstacles.
-        search: The search for nearby surfaces.
+        contacts: The contact.
     """
 
-    def __init__(self, system: System, surface: ContactSurface, obstacles: Obstacles, search: Search):
-        self._system, self._surface, self._obstacles = system, surface, obstacles
-        self._watch, self._device = search.watch, search.device
-
-    @property
-    def is_framed(self) -> bool:
-        """Whether margins count motion relative to frames; see ``Search.launch``."""
-        return not self._obstacles.count
+    def __init__(self, contacts: Contacts):
+        self._of, self._watch, self._device = contacts, contacts.search.watch, contacts.device
+        #: Whether margins count motion relative to frames; see ``Search.launch``.
+        self._is_framed = int(not contacts.obstacles.count)
 
     def launch(self, offset: int, act: Callable[[], None]) -> None:
         """Launch the motion of obstacles, and what contact does in a step while it is awake.
@@ -264,27 +262,266 @@ class Sleep:
             offset: The number of steps since the clock was last advanced.
             act: Launches that.
         """
-        obstacles = self._obstacles
+        contacts = self._of
+        obstacles, system = contacts.obstacles, contacts.system
         obstacles.launch_targets()
-        for k, body in enumerate(self._system.bodies):
-            start, count, nodes = self._surface.nodes_of(k)
-            moved = self._system.worlds * obstacles.count if k == 0 else 0
+        for k, body in enumerate(system.bodies):
+            count = contacts.surface.nodes_of(k)[1]
+            moved = system.worlds * obstacles.count if k == 0 else 0
             threads = max(count, moved)
-            inputs = [threads, start, count, nodes, int(self.is_framed), moved, obstacles.motions]
-            inputs += [body.conditions.world_starts, self._system.pace.arrays, offset]
-            inputs += [*self._places(k), body.state.velocities]
+            inputs = [threads, count, self._is_framed, moved, obstacles.motions, body.conditions.world_starts]
+            inputs += [contacts.part(k, offset)]
             wp.launch(kernels.rouse, threads, inputs, [self._watch], device=self._device)
         # A branch takes longer than launches that end at once.
         act()
 
     def launch_check(self) -> None:
         """Launch the test after a run whether anything moved too far in its last step."""
-        for k in range(len(self._system.bodies)):
-            start, count, nodes = self._surface.nodes_of(k)
-            inputs = [start, nodes, int(self.is_framed), self._system.pace.arrays, *self._places(k)]
+        for k in range(len(self._of.system.bodies)):
+            inputs = [self._is_framed, self._of.part(k)]
+            count = self._of.surface.nodes_of(k)[1]
             wp.launch(kernels.check_sleep, count, inputs, [self._watch], device=self._device)
 
-    def _places(self, k: int) -> list[wp.array]:
-        """Rest positions and displacements of a body."""
-        state = self._system.bodies[k].state
-        return [state.rest, state.displacements]
+
+# --- pairs of soft surfaces -------------------------------------------------------------------------------------------
+
+#: What obstacles' rows and pairs have, by type.
+ROWS = {
+    wp.int32: ("acts",),
+    wp.float32: ("gap", "friction"),
+    wp.vec3: ("normal", "moved", "force", "more"),
+    wp.vec4: ("weights",),
+}
+#: Initial room for pairs, over the number of nodes and edges; and its growth if it is too small.
+PAIRS_EACH = 2
+GROWTH = 2.0
+#: Number of searches after which trees of boxes are built again, because neighbours may have changed by then.
+REBUILT = 100
+#: For so many elements at most motion is reserved while nothing is near, if bodies do not touch themselves, and if they
+#: do: then so much of the same body is that near that searches take longer.
+CALM, CALM_ITSELF = 8.0, 1.0
+#: How many times the largest motion is reserved on the CPU, where pairs that are near take longer than searches.
+HIT_ON_CPU = 1.0
+
+
+class Pairs:
+    """Pairs of nodes and triangles, and of edges, of all bodies.
+
+    Args:
+        surface: The bodies' surfaces.
+        search: The search for nearby surfaces.
+        options: The options of contact.
+        ranks: The processes that compute other elements.
+
+    Attributes:
+        rows: The pairs, as a struct for kernels.
+        meeting: The things that may meet, as a struct for kernels.
+        tree: What finds their neighbours on the CPU, as a struct for kernels.
+        revision: Changes whenever launches do.
+    """
+
+    def __init__(
+        self,
+        surface: ContactSurface,
+        search: Search,
+        options: Contact,
+        ranks: Halo = ALONE,
+    ):
+        self._ranks = ranks
+        self.surface, self.search, self.device = surface, search, surface.device
+        self.friction, self.meets_itself, self._flat_edges = options.friction, options.self_contact, options.flat_edges
+        self.revision, self._room, self._taken, self._built = 0, 0, -1, 0
+        search.watch.most_calm = CALM_ITSELF if self.meets_itself else CALM
+        search.watch.hit = HIT_ON_CPU if self.device.is_cpu else float(kernels.HIT)
+        if self.meets_itself:
+            search.watch.most_alone = 1.0
+        search.find_pairs = self.find
+        self.follow()
+
+    # --- places and room -------------------------------------------------------------------------------------------
+
+    def follow(self) -> None:
+        """Update to the present surfaces."""
+        surface, device = self.surface, self.device
+        if surface.revision == self._taken:
+            if device.is_cpu:
+                self._is_planted = False  # leaves are of the triangles that there were
+            self.forget()
+            return
+        self._taken = surface.revision
+        count, edges = surface.count, surface.edge_count
+        meeting = Meeting()
+        meeting.normals = wp.zeros(surface.triangle_count, dtype=wp.vec3, device=device)
+        meeting.outs = wp.zeros(edges, dtype=wp.vec3, device=device)
+        meeting.reach, meeting.ahead = self.search.watch.reach, self.search.watch.ahead
+        meeting.meets_itself, meeting.flat_edges = int(self.meets_itself), int(self._flat_edges)
+        meeting.roots = wp.zeros((2, surface.worlds, len(surface.parts)), dtype=wp.int32, device=device)
+        self.meeting = meeting
+        self.tree, self._is_planted = wide_tree.WideTree(), False
+        self._boxes = [
+            tuple(wp.zeros(max(number, 1), dtype=wp.vec3, device=device) for _ in range(2))
+            for number in (surface.triangle_count, edges)
+        ]
+        self._trees: list[wp.Bvh] = []
+        self._make_room(max(self._room, PAIRS_EACH * (count + edges)))
+
+    def _make_room(self, room: int) -> None:
+        """Reserve room for a number of pairs. There are no pairs until the next search.
+
+        Raises:
+            UnstableError: There is no memory for them.
+        """
+        try:
+            self.rows, self._old = self._rows_for(room)
+        except (MemoryError, RuntimeError) as error:
+            raise UnstableError(
+                f"{room} pairs of soft surfaces come near one another, and {self.device} has no memory for so many; "
+                "elements must be larger where surfaces meet"
+            ) from error
+        self._room = room
+        self.search.forget()
+        self.revision += 1
+
+    def _rows_for(self, room: int) -> tuple[Rows, OldRows]:
+        device, owners = self.device, self.surface.count + self.surface.edge_count
+        rows, old = rows_of(room, device), OldRows()
+        rows.friction.fill_(self.friction)
+        rows.total = self.search.total
+        rows.total.zero_()
+        for kept in (rows, old):
+            kept.starts, kept.counts = (wp.zeros(owners, dtype=wp.int32, device=device) for _ in range(2))
+            kept.other = wp.zeros(room, dtype=wp.int32, device=device)
+        old.acts, old.force = wp.zeros_like(rows.acts), wp.zeros_like(rows.force)
+        rows.owner = wp.zeros(room, dtype=wp.int32, device=device)
+        rows.places = wp.zeros(room, dtype=wp.vec4i, device=device)
+        rows.away = wp.zeros(room if device.is_cpu else 0, dtype=wp.float32, device=device)
+        return rows, old
+
+    @property
+    def room(self) -> int:
+        """The number of pairs that there is room for."""
+        return self._room
+
+    def take_room(self, room: int) -> None:
+        """Reserve room for a number of pairs; there are no pairs until the next search."""
+        if room != self._room:
+            self._make_room(room)
+
+    # --- what the host sees ----------------------------------------------------------------------------------------
+
+    @property
+    def is_full(self) -> bool:
+        """Whether the last run needed more room than there is; known after the device has finished it."""
+        return self.search.pairs > self._room
+
+    def grow(self) -> None:
+        """Reserve the room that the last run needed."""
+        if self.is_full:
+            self._make_room(int(GROWTH * self.search.pairs))
+
+    @property
+    def is_planted(self) -> bool:
+        """Whether there are trees of boxes of the present surfaces."""
+        return self._is_planted
+
+    def prepare(self) -> None:
+        """Make everything that launches need."""
+        if not self._is_planted:
+            self._is_planted = True
+            self.revision += 1
+            if self.device.is_cpu:
+                self.tree = planted(self.surface)
+                return
+            self._box()
+            self._trees = [
+                wp.Bvh(lower, upper, groups=groups)
+                for (lower, upper), groups in zip(self._boxes, self._groups(), strict=True)
+            ]
+            self._find_roots()
+        elif self._trees and self.search.count >= self._built + REBUILT:
+            # Pairs are the same, and in the same order.
+            for tree in self._trees:
+                tree.rebuild()
+            self._find_roots()
+
+    def _find_roots(self) -> None:
+        """Find the roots of trees that have just been built."""
+        self._built = self.search.count
+        for k, tree in enumerate(self._trees):
+            roots = self.meeting.roots[k]
+            wp.launch(wide_tree.find_roots, roots.size, [tree.id], [roots.flatten()], device=self.device)
+
+    def forget(self) -> None:
+        """Forget the forces of the last step."""
+        self.rows.force.zero_()
+
+    # --- launches --------------------------------------------------------------------------------------------------
+
+    def _box(self) -> None:
+        inputs = [self.surface.arrays, self.meeting]
+        boxed = (wide_tree.box_triangles, wide_tree.box_edges)
+        for kernel, (lower, upper) in zip(boxed, self._boxes, strict=True):
+            wp.launch(kernel, len(lower), inputs, [lower, upper], device=self.device)
+
+    def find(self) -> None:
+        """Launch the search for pairs."""
+        watch, rows, old, device = self.search.watch, self.rows, self._old, self.device
+        if self.meets_itself:
+            self._mark_crushed()
+        self._box()
+        if device.is_cpu:
+            self._fill()
+        for tree in self._trees:
+            tree.refit()
+        owners = len(rows.starts)
+        wp.launch(keep_rows, owners, [watch, rows, old], [self.search.most], device=device)
+        wp.launch(begin_rows, 1, [watch, rows], device=device)
+        trees = [self.tree, *([tree.id for tree in self._trees] or (0, 0))]
+        threads = owners * (1 if device.is_cpu else int(WARP))
+        inputs = [watch, *trees, self.surface.arrays, self.meeting, old]
+        wp.launch(pair_finder(device.is_cpu), threads, inputs, [rows, self.search.near], device=device)
+
+    def _fill(self) -> None:
+        """Launch the boxes of the wide tree."""
+        tree, watch, leaves = self.tree, self.search.watch, len(self.tree.triangle_starts) - 1
+        inputs = [watch, self.surface.arrays, self.meeting, *self._boxes[0], *self._boxes[1]]
+        wp.launch(wide_tree.fill_leaves, leaves, inputs, [tree], device=self.device)
+        lanes = int(wide_tree.LANES)
+        levels = ((tree.lower_nodes, tree.upper_nodes), (tree.upper_nodes, tree.roots))
+        for k, (children, nodes) in enumerate(levels):
+            wp.launch(wide_tree.fill_nodes, leaves // lanes ** (k + 1), [watch, children], [nodes], device=self.device)
+
+    def _groups(self) -> list[wp.array]:
+        """The group of each triangle and of each edge: its body in its world; see ``Meeting``."""
+        parts, worlds = self.surface.parts, self.surface.worlds
+        found = []
+        for name, (lower, _) in zip(("triangles", "edges"), self._boxes, strict=True):
+            of_parts = [
+                np.repeat(len(parts) * np.arange(worlds) + k, getattr(part, name)) for k, part in enumerate(parts)
+            ]
+            groups = np.concatenate(of_parts).astype(np.int32)
+            found.append(wp.array(np.resize(groups, len(lower)), dtype=wp.int32, device=self.device))
+        return found
+
+    def _mark_crushed(self) -> None:
+        near, watch = self.search.near, self.search.watch
+        surface = self.surface
+        for (body, places), part in zip(surface.solids, surface.parts, strict=True):
+            kernel, elements = mark_crushed(body.discretization.element_kind), body.discretization.elements
+            inputs = [watch, elements, body.state.displacements, places, int(part.bearers > 0), surface.arrays]
+            wp.launch(kernel, body.sizes.launch_elements, inputs, [near], device=self.device)
+        self._ranks.max(near.flags)
+
+
+def rows_of(count: int, device: wp.Device) -> Rows:
+    """A table of so many rows, without what only pairs have."""
+    rows = Rows()
+    for dtype, names in ROWS.items():
+        for name in names:
+            setattr(rows, name, wp.zeros(count, dtype=dtype, device=device))
+    return rows
+
+
+def smallest_size(volumes: list[float]) -> float:
+    """The size of the smallest of some elements [m], from their volumes [m^3]."""
+    return float(np.min(volumes)) ** (1.0 / 3.0)

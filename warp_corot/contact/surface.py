@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, cast
 
 import numpy as np
 import numpy.typing as npt
 import warp as wp
 
+from warp_corot.kernels.contact import wide_tree
 from warp_corot.kernels.contact.motion import Bearing, Surface
+from warp_corot.kernels.distributed.exchange import clear_values
+from warp_corot.solvers.halo import Halo
+from warp_corot.solvers.system import System
 
 from .skin import FollowedSurface, Skin, has_own_surface
 
@@ -51,8 +55,8 @@ class Part:
     triangles: int
     edges: int
     bearers: int
-    skin: Skin
-    version: int
+    skin: Skin = field(kw_only=True)
+    version: int = field(kw_only=True)
 
     @property
     def sizes(self) -> list[int]:
@@ -79,6 +83,7 @@ class ContactSurface:
         edges, sides: Places of the ends of edges, and the two triangles of each, vec2i [E]; -1 where there is none.
         corner_starts, corners: For each node, from one start to the next: three times a triangle and which corner.
         parts: The place of each body.
+        count, triangle_count, edge_count, bearer_count: Number of places for nodes, triangles, edges and bearers.
         places: For each body the place of each node, or its place among the bearers if the body has these, int32
             [nodes]; -1 for others.
         revision: Changes whenever arrays are replaced.
@@ -117,30 +122,6 @@ class ContactSurface:
         """The bodies whose elements this process computes, and the place of each of their nodes, int32 [nodes]; -1
         inside."""
         return list(zip(self.bodies, self.places, strict=True))
-
-    @property
-    def count(self) -> int:
-        """Number of places for nodes."""
-        last = self.parts[-1]
-        return last.start + self.worlds * last.nodes
-
-    @property
-    def triangle_count(self) -> int:
-        """Number of places for triangles."""
-        last = self.parts[-1]
-        return last.triangle_start + self.worlds * last.triangles
-
-    @property
-    def edge_count(self) -> int:
-        """Number of places for edges."""
-        last = self.parts[-1]
-        return last.edge_start + self.worlds * last.edges
-
-    @property
-    def bearer_count(self) -> int:
-        """Number of places for bearers."""
-        last = self.parts[-1]
-        return last.bearer_start + self.worlds * last.bearers
 
     @property
     def is_borne(self) -> bool:
@@ -228,31 +209,26 @@ class ContactSurface:
     # --- pieces ----------------------------------------------------------------------------------------------------
 
     def _make_room(self, skins: Sequence[Skin], rooms: Sequence[Sequence[int]] | None = None) -> None:
-        self.parts = []
-        start = triangle_start = edge_start = bearer_start = 0
+        self.parts, starts = [], [0, 0, 0, 0]
         for k, (body, skin) in enumerate(zip(self.bodies, skins, strict=True)):
             more = ROOM if body.changing is not None else 1.0
             least = _sizes(skin)
             sizes = [int(more * size) for size in least]
             if rooms is not None:
                 sizes = [max(int(room), size) for room, size in zip(rooms[k], least, strict=True)]
-            nodes, triangles, edges, bearers = sizes
-            starts = (start, triangle_start, edge_start, bearer_start)
-            self.parts.append(Part(*starts, nodes, triangles, edges, bearers, skin, body.version))
-            start += self.worlds * nodes
-            triangle_start += self.worlds * triangles
-            edge_start += self.worlds * edges
-            bearer_start += self.worlds * bearers
-        count, device = start, self.device
-        self.bearers = _places(bearer_start, device)
+            self.parts.append(Part(*starts, *sizes, skin=skin, version=body.version))
+            starts = [start + self.worlds * size for start, size in zip(starts, sizes, strict=True)]
+        self.count, self.triangle_count, self.edge_count, self.bearer_count = starts
+        count, device = self.count, self.device
+        self.bearers = _places(self.bearer_count, device)
         self.arrays = _places(count, device)
         self.arrays.bearing = self._room_for_bearing(count)
-        self.triangles = wp.empty(triangle_start, dtype=wp.vec3i, device=device)
-        self.opposite = wp.empty(triangle_start, dtype=wp.int32, device=device)
-        self.warmth = wp.empty(triangle_start, dtype=wp.float32, device=device)
-        self.edges, self.sides = (wp.empty(edge_start, dtype=wp.vec2i, device=device) for _ in range(2))
+        self.triangles = wp.empty(self.triangle_count, dtype=wp.vec3i, device=device)
+        self.opposite = wp.empty(self.triangle_count, dtype=wp.int32, device=device)
+        self.warmth = wp.empty(self.triangle_count, dtype=wp.float32, device=device)
+        self.edges, self.sides = (wp.empty(self.edge_count, dtype=wp.vec2i, device=device) for _ in range(2))
         self.corner_starts = wp.empty(count + 1, dtype=wp.int32, device=device)
-        self.corners = wp.empty(3 * triangle_start, dtype=wp.int32, device=device)
+        self.corners = wp.empty(3 * self.triangle_count, dtype=wp.int32, device=device)
         for name in ("triangles", "opposite", "warmth", "edges", "sides", "corner_starts", "corners"):
             setattr(self.arrays, name, getattr(self, name))
         self.arrays.body = wp.array(self.body_of_places(), dtype=wp.int32, device=device)
@@ -378,3 +354,222 @@ def _places(count: int, device: wp.Device) -> Surface:
         setattr(arrays, name, wp.zeros(count, dtype=wp.vec3, device=device))
     arrays.yielding = wp.zeros(count, dtype=wp.float32, device=device)
     return arrays
+
+
+# --- surfaces of bodies whose parts several ranks hold ----------------------------------------------------------------
+
+#: What a surface's struct has besides the nodes.
+SHARED = ("world", "rest", "x", "d", "yielding", "f")
+#: The arrays of places, or of bearers, that ranks exchange.
+EXCHANGED = ("x", "d", "yielding")
+
+
+class WholeSurface(ContactSurface):
+    """The whole surfaces, of which each rank moves some nodes or bearers. All ranks do the same with them.
+
+    Args:
+        system: The parts of the bodies that this rank computes.
+        are_own, are_close: As for ``ContactSurface``.
+    """
+
+    is_whole = True
+
+    def __init__(self, system: System, *, are_own: bool = False, are_close: bool = False):
+        self._system = system
+        wholes = [system.ranks.owned(body).whole for body in system.bodies]
+        super().__init__(wholes, are_own=are_own, are_close=are_close, device=system.device)
+
+    @property
+    def own(self) -> Surface:
+        return self._own
+
+    @property
+    def own_bearers(self) -> Surface:
+        return self._own_bearers
+
+    @property
+    def solids(self) -> list[tuple[SoftBody, wp.array]]:
+        return self._solids
+
+    def complete(self) -> None:
+        """Launch the exchange after which every rank has the motion of all places at nodes, and of all bearers."""
+        for exchange, arrays in zip(self._exchanges, (self.arrays, self.bearers), strict=True):
+            for values in (getattr(arrays, name) for name in EXCHANGED):
+                if len(values):
+                    exchange(values)
+
+    def _fill(self) -> None:
+        super()._fill()
+        ranks, self._solids = self._system.ranks, []
+        at_places, at_bearers = (_Held(each) for each in (self.arrays, self.bearers))
+        for k, (part, whole) in enumerate(zip(self._system.bodies, self.bodies, strict=True)):
+            owned = ranks.owned(part)
+            numbers, is_own = owned.places, owned.nodes
+            number = np.full(whole.node_count, NO_NODE, np.int32)
+            number[numbers[is_own]] = np.flatnonzero(is_own)
+            rest = whole.state.rest.numpy()[:, :3]
+            here = self.parts[k]
+            if here.bearers:
+                at_bearers.take(here.bearer_start, self.worlds * here.bearers, number, rest)
+            else:
+                at_places.take(here.start, self.worlds * here.nodes, number, rest)
+            of_nodes = np.full(len(part.state.rest), -1, np.int32)
+            of_nodes[: len(numbers)] = self.places[k].numpy()[numbers]
+            self._solids.append((part, wp.array(of_nodes, dtype=wp.int32, device=self.device)))
+        self._own, self._own_bearers = at_places.own(self.device), at_bearers.own(self.device)
+        self._exchanges = [ranks.connect(np.arange(len(own)), own) for own in (at_places.moved, at_bearers.moved)]
+
+
+class _Held:
+    """Places of a surface, or its bearers, and which of them this rank moves.
+
+    Args:
+        whole: All of them.
+    """
+
+    def __init__(self, whole: Surface):
+        self._whole, self._node = whole, whole.node.numpy()
+        self._found = np.full(len(self._node), NO_NODE, np.int32)
+        self._rest = whole.rest.numpy()
+
+    def take(self, start: int, count: int, number: npt.NDArray[np.int32], rest: npt.NDArray[np.float32]) -> None:
+        """Take those of a body.
+
+        Args:
+            start, count: Where they are.
+            number: The number in this rank's part of each node of the whole body, -1 for those of other ranks.
+            rest: The rest positions of the nodes [m].
+        """
+        used = start + np.flatnonzero(self._node[start : start + count] >= 0)
+        self._found[used] = number[self._node[used]]
+        self._rest[used] = rest[self._node[used]]
+
+    @property
+    def moved(self) -> npt.NDArray[np.bool_]:
+        """Which of them this rank moves, bool."""
+        return self._found >= 0
+
+    def own(self, device: wp.Device) -> Surface:
+        """The same arrays with only the nodes that this rank moves, by their numbers in its parts."""
+        self._whole.rest.assign(self._rest)
+        made = Surface()
+        for name in SHARED:
+            setattr(made, name, getattr(self._whole, name))
+        made.node = wp.array(self._found, dtype=wp.int32, device=device)
+        return made
+
+
+class SurfaceHalo:
+    """The exchange of values at the places of a surface.
+
+    A rank has all triangles of the bodies' surfaces around its nodes. It finds the forces of obstacles on them from the
+    same numbers as the other ranks that have these triangles. Its sums at nodes of other ranks are incomplete and are
+    replaced.
+
+    Args:
+        ranks: The ranks; alone, nothing is launched.
+        surface: This rank's surfaces.
+
+    Attributes:
+        ranks: As given.
+        exchange: Launches the exchange of an array over the places, of any numbers or vectors.
+    """
+
+    def __init__(self, ranks: Halo, surface: ContactSurface):
+        self.ranks = ranks
+        node = surface.arrays.node.numpy()
+        number, own = np.full(len(node), -1, np.int64), np.ones(len(node), bool)
+        first = 0
+        for k, body in enumerate(() if ranks.is_alone else surface.bodies):
+            owned = ranks.owned(body)
+            assert owned.numbers is not None
+            here = np.arange(len(node))[surface.places_of(k)]
+            here = here[node[here] >= 0]
+            number[here], own[here] = first + owned.numbers[node[here]], owned.nodes[node[here]]
+            first += owned.node_count
+        self.exchange = ranks.connect(number, own & (number >= 0))
+        self._ghosts = wp.array(np.flatnonzero(~own).astype(np.int32), dtype=wp.int32, device=surface.device)
+
+    def clear(self, forces: wp.array) -> None:
+        """Launch the reset to zero of forces on nodes of other ranks: their own ranks add them."""
+        if len(self._ghosts):
+            wp.launch(clear_values, len(self._ghosts), [self._ghosts], [forces], device=self._ghosts.device)
+
+
+# --- the tree of the CPU ----------------------------------------------------------------------------------------------
+
+LANES = int(wide_tree.LANES)
+#: Leaves of a root.
+OF_ROOT = LANES * LANES
+
+Numbers = npt.NDArray[np.integer]
+Floats = npt.NDArray[np.float32]
+
+
+def planted(surface: ContactSurface) -> wide_tree.WideTree:
+    """The tree of surfaces whose places at rest are known; boxes are not."""
+    tree, corners, sides = wide_tree.WideTree(), surface.triangles.numpy(), surface.sides.numpy()[:, 0]
+    used = np.flatnonzero(corners[:, 0] >= 0)
+    bodies, parts = surface.body_of_places(), len(surface.parts)
+    group = surface.arrays.world.numpy()[corners[used, 0]] * parts + bodies[corners[used, 0]]
+    leaf, leaf_group = _leaves(surface.arrays.rest.numpy()[corners[used]], group)
+    # Each body in each world begins with a root.
+    counts = np.bincount(leaf_group, minlength=surface.worlds * parts)
+    roots = -(-counts // OF_ROOT)
+    first = np.concatenate([[0], np.cumsum(roots)])
+    number = OF_ROOT * first[leaf_group] + np.arange(len(leaf_group)) - (np.cumsum(counts) - counts)[leaf_group]
+    of = np.full(len(corners), -1)
+    of[used] = number[leaf]
+    leaves = OF_ROOT * max(int(first[-1]), 1)
+    of_edges = np.where(sides >= 0, of[sides], -1)
+    arrays = {"root_starts": first[::parts], "root_bodies": np.repeat(np.arange(len(roots)) % parts, roots)}
+    for name, of_items in (("triangle", of), ("edge", of_edges)):
+        starts, items = _lanes(of_items, leaves)
+        arrays |= {f"{name}_starts": starts, f"{name}s": items}
+    arrays["found"] = np.zeros(len(corners) + len(sides))
+    sizes = {"triangle_nodes": len(arrays["triangles"]), "edge_nodes": len(arrays["edges"]), "lower_nodes": leaves}
+    sizes |= {"upper_nodes": leaves // LANES, "roots": -(-leaves // OF_ROOT // LANES) * LANES}
+    for name, values in arrays.items():
+        setattr(tree, name, wp.array(values.astype(np.int32), dtype=wp.int32, device=surface.device))
+    empty = np.full((int(wide_tree.ROWS), LANES), 0.0, np.float32)
+    empty[:3], empty[3:6] = wide_tree.FAR, -wide_tree.FAR
+    for name, size in sizes.items():
+        values = np.tile(empty.ravel(), size // LANES)
+        setattr(tree, name, wp.array(values, dtype=wp.float32, device=surface.device))
+    return tree
+
+
+def _leaves(x: Floats, group: Numbers) -> tuple[Numbers, Numbers]:
+    """The leaf of each of some triangles with corners x, [T, 3, 3], and the group of each leaf, in the order of groups:
+    halves of halves of each group, across the longest extent of centres and normals."""
+    middle, normals = x.mean(axis=1), np.cross(x[:, 1] - x[:, 0], x[:, 2] - x[:, 0])
+    areas = np.linalg.norm(normals, axis=1)
+    # Triangles that lie back to back differ as much as those a leaf apart.
+    across = np.sqrt(LANES * areas.mean()) if len(x) else 1.0
+    points = np.concatenate([middle, across * normals / np.maximum(areas, 1e-30)[:, None]], axis=1)
+    order = np.argsort(group, kind="stable")
+    starts = np.flatnonzero(np.diff(group[order], prepend=-1))
+    while True:
+        ends = np.append(starts[1:], len(order))
+        if (ends - starts).max(initial=0) <= LANES:
+            break
+        leaf, at = np.repeat(np.arange(len(starts)), ends - starts), points[order]
+        extent = np.maximum.reduceat(at, starts) - np.minimum.reduceat(at, starts)
+        order = order[np.lexsort((at[np.arange(len(at)), extent.argmax(axis=1)[leaf]], leaf))]
+        # Full leaves, but for the last one.
+        halves = starts + LANES * -(-(ends - starts) // (2 * LANES))
+        starts = np.unique(np.concatenate([starts, halves[ends - starts > LANES]]))
+    found = np.empty(len(order), np.int64)
+    found[order] = np.repeat(np.arange(len(starts)), ends - starts)
+    return found, group[order[starts]]
+
+
+def _lanes(of: Numbers, leaves: int) -> tuple[Numbers, Numbers]:
+    """The first node of each leaf, and what is in the lanes of nodes: the items of each leaf."""
+    items = np.flatnonzero(of >= 0)
+    items = items[np.argsort(of[items], kind="stable")]
+    counts = np.bincount(of[items], minlength=leaves)
+    starts = np.concatenate([[0], np.cumsum(-(-counts // LANES))])
+    lanes = np.full(LANES * starts[-1], -1)
+    lanes[LANES * starts[of[items]] + np.arange(len(items)) - (np.cumsum(counts) - counts)[of[items]]] = items
+    return starts, lanes

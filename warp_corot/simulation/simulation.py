@@ -39,8 +39,7 @@ from warp_corot.inputs.loading import (
     wait_for,
 )
 from warp_corot.inputs.simulation_lock import SIMULATION_LOCK, under_lock
-from warp_corot.kernels.contact.crushed import count_crushed
-from warp_corot.kernels.contact.search import pair_finder
+from warp_corot.kernels.contact.search import count_crushed, pair_finder
 from warp_corot.kernels.elements.elements import ForestElements
 from warp_corot.kernels.stepping.integrate import STEP_SYMPLECTIC_EULER
 from warp_corot.kernels.stepping.stability import find_strains
