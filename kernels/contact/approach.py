@@ -17,7 +17,7 @@ from .bearing import carriers_of, find_borne
 from .explicit_rows import FORESEEN, OUT, Rigid
 from .explicit_step import push
 from .mass_split import Sums, take_force
-from .motion import Bearing, Foreseen, Part, Surface, distance_between, foreseen, kick_of
+from .motion import Bearing, Foreseen, Motions, Part, Surface, distance_between, foreseen, kick_of
 from .shapes import GROUND, distance_to, sure_distance
 from .watch import BESIDE, FAR, FARTHEST, STABLE, Near, Watch, begin_obstacle, pair_of
 
@@ -152,10 +152,9 @@ def find_entries(bearing: Bearing, entries: wp.array[wp.vec4i]):
 
 
 @wp.kernel(enable_backward=False)
-def begin_visits(pace: Pace, world_starts: wp.array[wp.float64], offset: int, visits: Visits):
+def begin_visits(motions: Motions, pace: Pace, world_starts: wp.array[wp.float64], offset: int, visits: Visits):
     """Move obstacles, and forget the visits of the last step."""
     rigid = visits.rigid
-    motions = rigid.motions
     watch = visits.watch
     here = visits.here
     meets = float(0.0)

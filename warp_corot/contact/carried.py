@@ -260,8 +260,8 @@ def _add(to: npt.NDArray[np.float32], numbers: Ints, values: npt.NDArray[np.floa
 
 # --- checkpoints ------------------------------------------------------------------------------------------------------
 
-#: Arrays that follow from the shapes and the meshes, or that have other names, too.
-GIVEN = {"meeting", "shapes", "_arrays"}
+#: Arrays that follow from the shapes and the meshes.
+GIVEN = {"meeting", "shapes"}
 #: Arrays that each simulation has for itself: of motions, of its clock, and of when to search again.
 OWN = ("obstacles.", "search.", "rigid._pace.")
 

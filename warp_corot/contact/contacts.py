@@ -111,7 +111,6 @@ class Contacts:
             self.approach = Approach(self, self.rigid)
         #: Steps while nothing is near; None on the CPU, where nothing can be left out, and without searches.
         self.sleep = Sleep(self) if self.search.can_sleep else None
-        self._known: dict[tuple[int, int, float], Part] = {}
         self._revision = 0
         self._is_looked_at = self._has_crushed = False
         self._make_arrays()
@@ -129,7 +128,6 @@ class Contacts:
         return {name: array for name, array in arrays.items() if array.size}
 
     def prepare(self) -> None:
-        self._known.clear()
         if self.is_full:
             self.grow()
         if self.surface.is_outdated:
@@ -169,7 +167,6 @@ class Contacts:
         """
         if not self._is_looked_at:
             self._is_looked_at = True
-            self._known.clear()
             self._predict(0, 0.0)
             warn_of_overlaps(self, OVERLAP * self.smallest)
 
@@ -306,10 +303,10 @@ class Contacts:
 
         Forces are carried if every rank has the whole surfaces, and forgotten if each has only a part.
         """
-        self.take_law(former)
         self.obstacles.continue_from(former.obstacles)
         wp.copy(self.obstacles.wrenches, former.obstacles.wrenches)
         self.search.continue_from(former.search)
+        self.take_law(former)
         self._is_looked_at, self._has_crushed = former._is_looked_at, former._has_crushed
         if self.surface.is_whole:
             carried = CarriedForces(former.surface, former.rigid, former.pairs)
@@ -320,6 +317,8 @@ class Contacts:
         """Take the constants of the law of contact from other contact, before the first step."""
         for name in ("tolerance", "recovery", "whole", "closing", "grain"):
             setattr(self.law, name, getattr(other.law, name))
+        if self.approach is not None:
+            self.approach.follow()
 
     # --- pieces ----------------------------------------------------------------------------------------------------
 
@@ -410,12 +409,8 @@ class Contacts:
             body.state.rebound_contact_surface = self.surface.rebound(body)
 
     def part(self, k: int, offset: int = 0, damping: float = 0.0) -> Part:
-        """The surface of the k-th body in a step, as a struct for kernels; the same until the next run."""
-        key = (k, offset, damping)
-        if key in self._known:
-            return self._known[key]
+        """The surface of the k-th body in a step, as a struct for kernels."""
         part, of = Part(), self.surface.parts[k]
-        self._known[key] = part
         part.number, part.place, part.shift = k, of.start, self.surface.count if of.bearers else 0
         part.start, _count, part.nodes = self.surface.nodes_of(k)
         part.dynamics = self.system.dynamics(self.system.bodies[k], damping)

@@ -54,7 +54,6 @@ class MassSplit:
 
     def __init__(self, contacts: Contacts):
         self._of, self.device, self._taken = contacts, contacts.device, (-1, -1)
-        self._known: tuple = ()
         rigid, pairs = contacts.rigid, contacts.pairs
         alone = pairs is None and not contacts.surface.is_borne and (rigid is None or rigid.is_separate)
         self._none = wp.zeros(0, dtype=wp.int32, device=self.device)
@@ -134,18 +133,11 @@ class MassSplit:
         inputs = [grain, totals, forces]
         wp.launch(sums.place_forces, surface.count, inputs, [surface.arrays], device=self.device, block_dim=BLOCK)
 
-    def _contacts(self) -> kernels.Contacts:
-        """All contacts as a struct for kernels, which is never changed."""
-        rigid, pairs = self._of.rigid_arrays, self._of.pairs
-        known = (rigid, None if pairs is None else pairs.rows, self._of.search.watch.places)
-        if len(self._known) != len(known) or any(a is not b for a, b in zip(known, self._known, strict=True)):
-            self._known, self._all = known, kernels.Contacts()
-            self._all.first_pair, self._all.searched = self.first_pair, self._of.search.watch.places
-            self._all.rigid, self._all.pairs = rigid, Rows() if pairs is None else pairs.rows
-        return self._all
-
     def _launch(self, near: Near, first: int, last: int, part: int) -> None:
-        search, contacts = self._of.search, self._contacts()
+        contacts, pairs, search = kernels.Contacts(), self._of.pairs, self._of.search
+        contacts.first_pair, contacts.searched = self.first_pair, search.watch.places
+        contacts.rigid = self._of.rigid_arrays
+        contacts.pairs = Rows() if pairs is None else pairs.rows
         inputs: list = [self._threads, part, first, last, self.iterations, int(self._are_separate)]
         inputs += [search.watch.awake, near, *self._listed, self._of.system.pace.arrays]
         outputs = [contacts, self._records, self.sums]
@@ -205,7 +197,7 @@ class Approach:
                 setattr(self.here, name, wp.zeros(size, dtype=wp.int32, device=device))
         inputs = [surface.arrays.bearing, self._visits.entries]
         wp.launch(approach.find_entries, surface.bearer_count, inputs, device=device)
-        self._known: tuple = (None, 0.0)
+        self._visits.rigid, self._visits.watch = self._rigid.arrays, self._of.search.watch
         self.forget()
 
     def forget(self) -> None:
@@ -220,11 +212,8 @@ class Approach:
             damping: The rate of damping [1/s].
             accounts: Count work on each body, if it is counted here.
         """
-        system, visits, rigid, watch = self._of.system, self._visits, self._rigid.arrays, self._of.search.watch
-        if self._known[0] is not rigid or self._known[1] != watch.size:
-            self._known = (rigid, watch.size)
-            visits.rigid, visits.watch = rigid, watch
-        inputs = [system.pace.arrays, system.bodies[0].conditions.world_starts, offset]
+        system, visits = self._of.system, self._visits
+        inputs = [self._of.obstacles.motions, system.pace.arrays, system.bodies[0].conditions.world_starts, offset]
         wp.launch(approach.begin_visits, 1, inputs, [visits], device=self._of.device)
         if len(system.constraints) > 1:  # which add to them
             self._clear()

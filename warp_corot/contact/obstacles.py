@@ -308,8 +308,6 @@ class RigidForces:
     def __init__(self, surface: ContactSurface, obstacles: Obstacles, search: Search, law: Law):
         self.surface, self.obstacles, self.search, self.device = surface, obstacles, search, surface.device
         self._law, self._taken = law, -1
-        self._key: tuple | None = None
-        self._arrays = Rigid()
         self.have_edges = obstacles.have_edges
         search.rigid = self
         self.follow()
@@ -332,13 +330,8 @@ class RigidForces:
 
     @property
     def arrays(self) -> Rigid:
-        """The obstacles, the surfaces and what is between them, as a struct for kernels, which is never changed."""
-        law = tuple(getattr(self._law, name) for name in ("tolerance", "recovery", "settling", "whole", "slack"))
-        key = (self._taken, self.obstacles.revision, law, self._law.closing, self._law.grain)
-        if key == self._key:
-            return self._arrays
-        self._key, self._arrays = key, Rigid()
-        rigid = self._arrays
+        """The obstacles, the surfaces and what is between them, as a struct for kernels."""
+        rigid = Rigid()
         rigid.shapes, rigid.motions, rigid.law = self.obstacles.shapes, self.obstacles.motions, self._law
         rigid.surface, rigid.first_triangle = self.surface.arrays, self.totals.size
         rigid.anchors, rigid.allowance, rigid.rows = self.anchors, self.allowance, self.rows
