@@ -1,11 +1,16 @@
 """PyTorch and JAX: the same memory on both sides, and steps among their own work."""
 
+import os
+
 import numpy as np
 import pytest
 import warp as wp
 from foreign import DT, allocates, bar
 
 import warp_corot as wc
+
+# JAX would take three quarters of a card, which other processes use, too.
+os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
 
 
 def ordinary(device, forces, steps):
