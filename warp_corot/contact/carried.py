@@ -16,8 +16,8 @@ from warp_corot.mesh.surfaces.bound import vertex_normals
 from .skin import Skin
 
 if TYPE_CHECKING:
-    from .contacts import Contacts
     from .obstacles import RigidForces
+    from .parts import AllContacts
     from .search import Pairs
     from .surface import ContactSurface
 
@@ -266,7 +266,7 @@ GIVEN = {"meeting", "shapes"}
 OWN = ("obstacles.", "search.", "rigid._pace.")
 
 
-def kept_arrays(contacts: Contacts) -> dict[str, wp.array]:
+def kept_arrays(contacts: AllContacts) -> dict[str, wp.array]:
     """All arrays that contact keeps from one step to the next, by name."""
     owners = {name: getattr(contacts, name) for name in ("search", "rigid", "pairs", "obstacles")}
     found = {
@@ -280,7 +280,7 @@ def kept_arrays(contacts: Contacts) -> dict[str, wp.array]:
     return {name: array for name, array in found.items() if array.size}
 
 
-def keep_again(contacts: Contacts, rooms: list[list[int]], room: int, kept: dict[str, Any]) -> None:
+def keep_again(contacts: AllContacts, rooms: list[list[int]], room: int, kept: dict[str, Any]) -> None:
     """Restore the arrays of ``kept_arrays``.
 
     Args:
@@ -304,7 +304,7 @@ def keep_again(contacts: Contacts, rooms: list[list[int]], room: int, kept: dict
         array.assign(values)
 
 
-def take_state(contacts: Contacts, former: Contacts) -> None:
+def take_state(contacts: AllContacts, former: AllContacts) -> None:
     """Go on from the forces of another simulation of the same bodies and obstacles. Obstacles keep their motion.
 
     Raises:

@@ -18,7 +18,7 @@ from warp_corot.kernels.implicit.assembled import Couplings
 from warp_corot.solvers.implicit.operator import Springs
 
 if TYPE_CHECKING:
-    from .contacts import Contacts
+    from .parts import AllContacts
 
 #: Types of the arrays of ``ImplicitRows``: of all rows, of triangles, of pairs, and of one number.
 OF_ROWS = {
@@ -50,7 +50,7 @@ class ImplicitContact:
         total: Number of pairs, int32 [1].
     """
 
-    def __init__(self, contacts: Contacts):
+    def __init__(self, contacts: AllContacts):
         self._of, self._rigid, self._pairs, self._law = contacts, contacts.rigid, contacts.pairs, contacts.law
         self._system, self._surface, self.device = contacts.system, contacts.surface, contacts.device
         self.couples = self._pairs is not None

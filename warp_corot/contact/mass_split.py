@@ -20,7 +20,7 @@ from .options import Contact, may_meet
 from .tool import Obstacle
 
 if TYPE_CHECKING:
-    from .contacts import Contacts
+    from .parts import AllContacts
 
 #: Number of iterations if contacts share nodes, and otherwise: then the first one is exact.
 ITERATIONS, EXACT = 4, 1
@@ -52,7 +52,7 @@ class MassSplit:
         iterations: Number of iterations of a step.
     """
 
-    def __init__(self, contacts: Contacts):
+    def __init__(self, contacts: AllContacts):
         self._of, self.device, self._taken = contacts, contacts.device, (-1, -1)
         rigid, pairs = contacts.rigid, contacts.pairs
         alone = pairs is None and not contacts.surface.is_borne and (rigid is None or rigid.is_separate)
@@ -161,7 +161,7 @@ class Approach:
         here: What may have touched an obstacle in the last step.
     """
 
-    def __init__(self, contacts: Contacts, rigid: RigidForces):
+    def __init__(self, contacts: AllContacts, rigid: RigidForces):
         self._of, self._rigid, self._taken = contacts, rigid, -1
         self.follow()
 

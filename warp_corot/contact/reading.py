@@ -25,7 +25,7 @@ from .tool import FITTING
 if TYPE_CHECKING:
     from warp_corot.body.soft_body import SoftBody
 
-    from .contacts import Contacts
+    from .parts import AllContacts
     from .search import Pairs
     from .tool import Obstacle, Tool
 
@@ -92,12 +92,12 @@ class ActingRow(NamedTuple):
     force: Floats
 
 
-def contact_points(contacts: Contacts) -> list[ContactPoint]:
+def contact_points(contacts: AllContacts) -> list[ContactPoint]:
     """All contacts of the last step, pairs of soft surfaces once; waits for the device."""
     return [_point(contacts, row) for row in acting_rows(contacts)]
 
 
-def acting_rows(contacts: Contacts) -> Iterator[ActingRow]:
+def acting_rows(contacts: AllContacts) -> Iterator[ActingRow]:
     """All contacts of the last step; waits for the device."""
     x = contacts.surface.arrays.x.numpy().astype(float)
     if contacts.pairs is not None:
@@ -120,7 +120,7 @@ def _of_pairs(pairs: Pairs, x: Floats, nodes: int) -> Iterator[ActingRow]:
         yield ActingRow(-1, first, places[k], weights[k], point, normal[k], float(gap[k]), force[k])
 
 
-def _at_places(contacts: Contacts, rigid: RigidForces, x: Floats) -> Iterator[ActingRow]:
+def _at_places(contacts: AllContacts, rigid: RigidForces, x: Floats) -> Iterator[ActingRow]:
     forces, obstacles = rigid.forces.numpy().astype(float), contacts.obstacles
     those, places = np.nonzero(forces.any(axis=2))
     given = those, contacts.surface.arrays.world.numpy()[places], x[places, None]
@@ -139,7 +139,7 @@ def _at_triangles(rigid: RigidForces, corners: npt.NDArray[np.integer], x: Float
         yield ActingRow(o, 3, places, w, w @ x[places], normal[r], float(gap[r]), force[r])
 
 
-def _point(contacts: Contacts, row: ActingRow) -> ContactPoint:
+def _point(contacts: AllContacts, row: ActingRow) -> ContactPoint:
     surface, bodies = contacts.surface, contacts.system.bodies
     k, world, nodes, shares = surface.nodes_at(row.places[: row.first], row.weights[: row.first])
     other: Obstacle | SoftBody
@@ -158,7 +158,7 @@ def _point(contacts: Contacts, row: ActingRow) -> ContactPoint:
 
 
 def contact_at_nodes(
-    contacts: Contacts, k: int, body: SoftBody, world: int
+    contacts: AllContacts, k: int, body: SoftBody, world: int
 ) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
     """Contact of a body in the last step; waits for the device. Zero if the mesh has changed since.
 
@@ -210,7 +210,7 @@ ALONG = 9
 Surface = tuple[Floats, npt.NDArray[np.int32]]
 
 
-def warn_of_overlaps(contacts: Contacts, least: float) -> None:
+def warn_of_overlaps(contacts: AllContacts, least: float) -> None:
     """Check whether anything begins inside something else: obstacles in all worlds, soft bodies in the first.
 
     Args:
@@ -242,7 +242,7 @@ def warn_of_overlaps(contacts: Contacts, least: float) -> None:
             _warn_of_coarse_elements(contacts, surfaces, tool, points)
 
 
-def _own_surfaces(contacts: Contacts) -> Iterator[Surface]:
+def _own_surfaces(contacts: AllContacts) -> Iterator[Surface]:
     """Where the surface nodes of each body are in its first world [m], and its triangles."""
     places = contacts.surface.arrays.x.numpy().astype(float)
     for body, part in zip(contacts.system.bodies, contacts.surface.parts, strict=True):
@@ -255,7 +255,7 @@ def _own_surfaces(contacts: Contacts) -> Iterator[Surface]:
             yield whole.positions.numpy()[nodes].astype(float), corners.reshape(-1, 3).astype(np.int32)
 
 
-def warn_of_crushed(contacts: Contacts) -> bool:
+def warn_of_crushed(contacts: AllContacts) -> bool:
     """Check whether elements are turned inside out now; waits for the device.
 
     Warns:
@@ -280,7 +280,7 @@ def warn_of_crushed(contacts: Contacts) -> bool:
 # --- pieces ----------------------------------------------------------------------------------------------------------
 
 
-def _warn_of_coarse_elements(contacts: Contacts, surfaces: Sequence[Surface], tool: Tool, points: Floats) -> None:
+def _warn_of_coarse_elements(contacts: AllContacts, surfaces: Sequence[Surface], tool: Tool, points: Floats) -> None:
     """Warn of a tool that moves and is smaller than the elements of the body nearest to it, where it is nearest."""
     nearest = []
     for body, (places, triangles) in zip(contacts.system.bodies, surfaces, strict=True):
@@ -301,7 +301,7 @@ def _warn_of_coarse_elements(contacts: Contacts, surfaces: Sequence[Surface], to
 
 
 def _warn_of_what_bodies_hold(
-    contacts: Contacts, surfaces: Sequence[Surface], axes: list[tuple[Tool, Floats]], least: float, speed: str
+    contacts: AllContacts, surfaces: Sequence[Surface], axes: list[tuple[Tool, Floats]], least: float, speed: str
 ) -> None:
     """Warn of nodes of bodies, and of axes of tools, that begin inside other bodies."""
     own = [points for points, _ in surfaces]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import warp as wp
@@ -23,7 +23,6 @@ from .options import Contact
 from .surface import ContactSurface, planted
 
 if TYPE_CHECKING:
-    from .contacts import Contacts
     from .obstacles import Obstacles, RigidForces
 
 #: The least motion that is reserved for anything between two searches, as a fraction of the smallest element's size,
@@ -247,10 +246,10 @@ class Sleep:
     """What steps of awake and of sleeping contact launch.
 
     Args:
-        contacts: The contact.
+        contacts: The contact, a ``Contacts``.
     """
 
-    def __init__(self, contacts: Contacts):
+    def __init__(self, contacts: Any):
         self._of, self._watch, self._device = contacts, contacts.search.watch, contacts.device
         #: Whether margins count motion relative to frames; see ``Search.launch``.
         self._is_framed = int(not contacts.obstacles.count)
