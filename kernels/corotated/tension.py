@@ -245,7 +245,7 @@ def add_taut_product8(Elements: type) -> wp.Kernel:
 
 @functools.cache
 def add_taut_diagonal(Elements: type) -> wp.Kernel:
-    """Add the 3x3 blocks of tension on K's diagonal to those of the nodes; a thread a node of an element."""
+    """Add the 3x3 blocks of tension on K's diagonal to those of the nodes; each thread takes one node of an element."""
 
     @unique_kernel()
     def add_taut_diagonal(
